@@ -1,0 +1,180 @@
+"""Evaluation protocols: declarative TOML files, strict about every key."""
+
+from __future__ import annotations
+
+import importlib.resources
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from fieldkit.errors import ProtocolError, suggestion
+
+POLICY_NAMES = (
+    "stowed", "forward", "random", "odometry", "max", "angle", "fim", "mlp", "vpt", "vpt_dino", "vpt_appearance",
+    "best_possible",
+)  # fmt: skip
+COUNTING = ("max", "angle", "fim", "mlp", "vpt", "vpt_dino", "vpt_appearance")
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class Threshold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An image counts as localized when both errors are strictly below: position in m, rotation in deg."""
+
+    position_m: Positive
+    rotation_deg: Positive
+
+
+class CandidateRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which recorded views ranking policies choose among, and how visibility is computed at them."""
+
+    kinds: tuple[Literal["sweep", "stowed", "forward"], ...] = ("sweep",)
+    min_distance_m: float = 0.1
+    max_distance_m: Positive = 5.0
+    forward_pitch_deg: float = 0.0
+    last_forward: Literal["previous", "body"] = "previous"
+
+
+class OcclusionRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """With and without the filter, and how far behind the surface (in voxels) a landmark still counts as visible."""
+
+    use: tuple[bool, ...] = (False, True)
+    tolerance_voxels: Positive = 2.0
+
+
+class LocalizerRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the localizer: global retrieval, matching, and PnP."""
+
+    top_k: Annotated[int, msgspec.Meta(ge=1)] = 20
+    ratio: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.8
+    max_reprojection_px: Positive = 12.0
+    min_inliers: Annotated[int, msgspec.Meta(ge=4)] = 12
+
+
+class OdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Standard deviations with which the prior's covariance grows per metre travelled and radian turned."""
+
+    position_per_m: Positive = 0.02
+    yaw_deg_per_m: Positive = 0.5
+    yaw_deg_per_turn_deg: Positive = 0.01
+
+
+class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A bound that scoring checks (exit status 3 when missed): recall of a policy at a threshold of the protocol."""
+
+    policy: str
+    position_m: Positive
+    rotation_deg: Positive
+    min_recall: float = 0.0
+    max_recall: float = 1.0
+    occlusion: bool | None = None
+
+
+class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that is fixed before a recording is replayed and scored."""
+
+    name: str
+    thresholds: tuple[Threshold, ...]
+    policies: tuple[str, ...]
+    version: Literal[1] = 1
+    pose: Literal["cam", "body"] = "body"
+    feature: str = "sift"
+    seed: int = 0
+    candidates: CandidateRules = CandidateRules()
+    occlusion: OcclusionRules = OcclusionRules()
+    localizer: LocalizerRules = LocalizerRules()
+    odometry: OdometryNoise = OdometryNoise()
+    expect: tuple[Expect, ...] = ()
+
+
+def known_protocols() -> list[str]:
+    """Return the names of the protocols that ship with fieldkit."""
+    return sorted(p.name.removesuffix(".toml") for p in _folder().iterdir() if p.name.endswith(".toml"))
+
+
+def load(name_or_path: str | Path) -> Protocol:
+    """Load a protocol by its shipped name or from a TOML file.
+
+    Raises ProtocolError for a missing file, a key, policy or threshold that is unknown, or a value out of range.
+    """
+    text, source = _read(name_or_path)
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProtocolError(f"{source}: not valid TOML: {error}", hint="correct the file") from error
+    return from_dict(values, source=source)
+
+
+def from_dict(values: dict[str, Any], *, source: str) -> Protocol:
+    """Make a protocol from plain values (of a TOML file or run.json) and check them; errors name ``source``."""
+    version = values.get("version", 1)
+    if isinstance(version, int) and version > 1:
+        raise ProtocolError(f"{source}: version {version}; this fieldkit reads version 1", hint="update fieldkit")
+    try:
+        protocol = msgspec.convert(values, Protocol)
+    except msgspec.ValidationError as error:
+        raise ProtocolError(f"{source}: {_explain(str(error))}", hint="correct the protocol") from error
+    _check(protocol, source)
+    return protocol
+
+
+def to_dict(protocol: Protocol) -> dict[str, Any]:
+    """Return plain values that `from_dict` reads back."""
+    values: dict[str, Any] = msgspec.to_builtins(protocol)
+    return values
+
+
+def _folder() -> Any:
+    packaged = importlib.resources.files("fieldkit") / "_protocols"
+    return packaged if packaged.is_dir() else Path(__file__).resolve().parent.parent / "protocols"
+
+
+def _read(name_or_path: str | Path) -> tuple[str, str]:
+    path = Path(name_or_path)
+    if path.suffix == ".toml" or path.exists():
+        if not path.is_file():
+            raise ProtocolError(f"{path}: no such protocol file", hint=suggestion(str(path), known_protocols()))
+        return path.read_text(encoding="utf-8"), str(path)
+    if str(name_or_path) not in known_protocols():
+        raise ProtocolError(
+            f"unknown protocol {str(name_or_path)!r}; expected a name or a .toml file",
+            hint=suggestion(str(name_or_path), known_protocols()),
+        )
+    return (_folder() / f"{name_or_path}.toml").read_text(encoding="utf-8"), f"protocol {name_or_path}"
+
+
+def _explain(text: str) -> str:
+    unknown = re.match(r"Object contains unknown field `(.+?)`(?: - at `(.+)`)?", text)
+    if not unknown:
+        return text
+    where = unknown.group(2) or "$"
+    known = _fields_at(where)
+    return f"unknown key {unknown.group(1)!r} at {where}; {suggestion(unknown.group(1), known)}"
+
+
+def _fields_at(where: str) -> list[str]:
+    structs: dict[str, type[msgspec.Struct]] = {
+        "thresholds": Threshold, "candidates": CandidateRules, "occlusion": OcclusionRules,
+        "localizer": LocalizerRules, "odometry": OdometryNoise, "expect": Expect,
+    }  # fmt: skip
+    part = re.match(r"\$\.(\w+)", where)
+    return list((structs[part.group(1)] if part else Protocol).__struct_fields__)
+
+
+def _check(protocol: Protocol, source: str) -> None:
+    for name in (*protocol.policies, *(e.policy for e in protocol.expect)):
+        if name not in POLICY_NAMES:
+            raise ProtocolError(f"{source}: unknown policy {name!r}", hint=suggestion(name, POLICY_NAMES))
+    if not protocol.thresholds:
+        raise ProtocolError(f"{source}: no thresholds; expected at least one", hint="add [[thresholds]]")
+    if len(set(protocol.policies)) != len(protocol.policies):
+        raise ProtocolError(f"{source}: a policy is listed twice in {list(protocol.policies)}", hint="list it once")
+    for bound in protocol.expect:
+        if Threshold(bound.position_m, bound.rotation_deg) not in protocol.thresholds:
+            raise ProtocolError(
+                f"{source}: [[expect]] at {bound.position_m:g} m / {bound.rotation_deg:g} deg is not one of the "
+                "protocol's thresholds",
+                hint="add it to [[thresholds]]",
+            )

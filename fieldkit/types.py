@@ -1,0 +1,336 @@
+"""The nouns that the rooms hand to each other: frozen, without I/O."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.cameras import Camera
+from fieldkit.frames import Pose, Trajectory
+
+if TYPE_CHECKING:
+    from fieldkit.protocol import Protocol
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+ViewKind = Literal["sweep", "stowed", "forward", "truth"]
+VIEW_KINDS: tuple[ViewKind, ...] = ("sweep", "stowed", "forward", "truth")
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """One image of the robot's arm camera: header stamp, camera, kinematics, and the image read on demand.
+
+    ``read()`` returns uint8[h, w] (grey) or uint8[h, w, 3] (RGB). ``body_from_cam`` is None where tf does not reach.
+    """
+
+    t_ns: int
+    camera: Camera
+    body_from_cam: Pose | None
+    read: Callable[[], Image]
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """One recorded direction of the arm camera at a waypoint."""
+
+    id: str
+    kind: ViewKind
+    frame: Frame
+    repeat: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """An interval in which the robot stands in front of a start tag; ``visit`` names the only visit it serves."""
+
+    tag_id: int
+    t_begin_ns: int
+    t_end_ns: int
+    visit: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Visit:
+    """One waypoint: its interval, its views, the tripod tag that gives the truth, and the next waypoint."""
+
+    id: str
+    t_begin_ns: int
+    t_end_ns: int
+    views: tuple[View, ...]
+    next: str | None = None
+    truth_tag_id: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A recorded session: everything that replay needs, images on demand.
+
+    ``frames`` all images of the arm camera in the order of their stamps. ``odometry`` is odom_from_body.
+    ``reference`` is map_from_body from a pose topic (motion capture, total station, another system) or None.
+    """
+
+    name: str
+    path: str
+    layout: str
+    frames: tuple[Frame, ...]
+    odometry: Trajectory
+    starts: tuple[Start, ...]
+    visits: tuple[Visit, ...]
+    reference: Trajectory | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class TagPhoto:
+    """What became of one photo of a tag: ``reason`` is empty when it was used; sigma is its deviation in sigmas."""
+
+    file: str
+    tag_id: int
+    used: bool
+    reason: str = ""
+    visit: str | None = None
+    ambiguity: float = 0.0
+    sigma: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class TagPose:
+    """A tag in the map: map_from_tag, its 6x6 covariance, edge length of the black square, and how it was found."""
+
+    id: int
+    family: str
+    size_m: float
+    map_from_tag: Pose
+    covariance: Array
+    n_photos: int
+    rms_px: float
+    visit: str | None = None
+    verdict: Literal["pass", "warn", "fail"] = "pass"
+
+
+@dataclasses.dataclass(frozen=True)
+class TagMap:
+    """All tags of a session in the map with digest ``map_digest``; a tag that is moved has one pose per visit."""
+
+    tags: tuple[TagPose, ...]
+    photos: tuple[TagPhoto, ...]
+    map_digest: str
+    digest: str = ""
+    path: str = ""
+
+    def find(self, tag_id: int, *, visit: str | None = None) -> TagPose | None:
+        """Return the tag's pose for a visit, else its pose for every visit, else None."""
+        for wanted in (visit, None):
+            for tag in self.tags:
+                if tag.id == tag_id and tag.visit == wanted:
+                    return tag
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """A triangle mesh in the map frame: vertices float[n, 3] in m, faces int[m, 3]; the voxel size it was made with."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    voxel_m: float
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneMap:
+    """Landmarks in the metric, gravity aligned map frame, who saw them from where, and their descriptors.
+
+    Landmarks (n): ``xyz`` f64[n, 3] in m; ``xyz_covariance`` f64[n, 3, 3] in m^2.
+    Mapping images (k): ``image_names``, ``image_cameras``, ``map_from_image`` poses (camera in the map).
+    Observations (o), sorted by image: ``observation_landmark`` int32[o], ``observation_image`` int32[o],
+    ``observation_px`` f32[o, 2].
+    Descriptors (d): ``descriptors`` uint8 or float32[d, width], ``descriptor_landmark`` int32[d],
+    ``descriptor_image`` int32[d]; a compact map has one per landmark.
+    """
+
+    path: str
+    digest: str
+    feature: str
+    xyz: Array
+    xyz_covariance: Array
+    image_names: tuple[str, ...]
+    image_cameras: tuple[Camera, ...]
+    map_from_image: tuple[Pose, ...]
+    observation_landmark: NDArray[np.int32]
+    observation_image: NDArray[np.int32]
+    observation_px: NDArray[np.float32]
+    descriptors: NDArray[np.uint8] | NDArray[np.float32]
+    descriptor_landmark: NDArray[np.int32]
+    descriptor_image: NDArray[np.int32]
+    surface: Surface | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class LandmarkStatistics:
+    """From where mapping saw each landmark (n), as the paper's features and policies need it.
+
+    Distances in m. ``*_angle_rad``: smallest and largest angle between the viewing ray and the principal axis of the
+    observing images (camera frame). ``mean_direction`` f64[n, 3]: unit mean of the directions landmark -> camera;
+    ``spread_rad``: largest angle between it and an observing direction (Davison and Murray 2002, at the landmark).
+    """
+
+    min_distance_m: Array
+    max_distance_m: Array
+    min_angle_rad: Array
+    max_angle_rad: Array
+    mean_direction: Array
+    spread_rad: Array
+    n_observations: NDArray[np.int32]
+
+
+@dataclasses.dataclass(frozen=True)
+class Prior:
+    """Where the robot believes its body is at a waypoint: pose, 6x6 covariance, metres travelled since the start tag."""
+
+    visit: str
+    map_from_body: Pose
+    covariance: Array
+    t_ns: int
+    travelled_m: float
+    n_sightings: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidates:
+    """The views among which a policy chooses, at the prior: v camera poses, never images, estimates or truth.
+
+    ``allowed`` bool[v]: views that ranking policies may choose (the sweep, unless the protocol says otherwise).
+    ``forward_in_map`` unit vector (3,) along the path to the next waypoint, or None where nothing defines it.
+    """
+
+    visit: str
+    view_ids: tuple[str, ...]
+    kinds: tuple[ViewKind, ...]
+    map_from_cam: tuple[Pose, ...]
+    camera: Camera
+    allowed: NDArray[np.bool_]
+    forward_in_map: Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """The true camera pose of a view, its 6x6 covariance, and where it comes from (tag, topic or simulation)."""
+
+    visit: str
+    view: str
+    map_from_cam: Pose
+    body_from_cam: Pose
+    covariance: Array
+    source: Literal["tag", "topic", "simulation"]
+
+    @property
+    def sigma(self) -> tuple[float, float]:
+        """Standard deviation of position (m) and rotation (rad): root of the traces of the covariance's blocks."""
+        rotation, position = np.trace(self.covariance[:3, :3]), np.trace(self.covariance[3:, 3:])
+        return math.sqrt(max(position, 0.0)), math.sqrt(max(rotation, 0.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """A localized image: map_from_cam or None, covariance, counts, and seconds per stage.
+
+    ``status`` is "ok" or the reason of the failure: no_features, no_matches, few_inliers, no_pose.
+    """
+
+    map_from_cam: Pose | None
+    covariance: Array | None
+    n_matches: int
+    n_inliers: int
+    status: str
+    confidence: float
+    seconds: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """What a policy got at a visit: the chosen view, the weight of that choice, and its errors (inf when failed).
+
+    Angles in rad here, in deg on disk. ``occlusion`` is None for policies that do not count landmarks.
+    """
+
+    session: str
+    visit: str
+    policy: str
+    occlusion: bool | None
+    view: str
+    weight: float
+    utility: float
+    status: str
+    cam_error: tuple[float, float]
+    body_error: tuple[float, float]
+    truth_sigma: tuple[float, float]
+    prior_error: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewResult:
+    """An estimate with the view that it belongs to."""
+
+    session: str
+    visit: str
+    view: str
+    kind: ViewKind
+    t_ns: int
+    estimate: Estimate
+
+
+@dataclasses.dataclass(frozen=True)
+class VisitPlan:
+    """What was known at a visit before looking: prior, candidates, and every policy's utility per candidate.
+
+    ``utilities`` maps (policy, occlusion) to f64[v]; -inf is not allowed, never nan.
+    """
+
+    session: str
+    prior: Prior
+    prior_error: tuple[float, float]
+    candidates: Candidates
+    utilities: Mapping[tuple[str, bool | None], Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanView:
+    """A thinned map to draw from above: landmarks f32[n, 3] and mapping camera positions f32[k, 3]."""
+
+    landmarks: NDArray[np.float32]
+    cameras: NDArray[np.float32]
+
+
+@dataclasses.dataclass(frozen=True)
+class Excluded:
+    """Something that was left out of the result, and why."""
+
+    what: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A finished replay: everything that scoring and the report need, without images, bag or map."""
+
+    protocol: Protocol
+    map_digest: str
+    tags_digest: str
+    recordings: tuple[str, ...]
+    sessions: tuple[str, ...]
+    seed: int
+    versions: Mapping[str, str]
+    trials: tuple[Trial, ...]
+    results: tuple[ViewResult, ...]
+    truths: tuple[tuple[str, Truth], ...]
+    plans: tuple[VisitPlan, ...]
+    plan_view: PlanView
+    thumbnails: Mapping[str, bytes]
+    excluded: tuple[Excluded, ...] = ()
+    path: str = ""
