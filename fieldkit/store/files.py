@@ -1,0 +1,185 @@
+"""Files that are written whole or not at all, strict reading, and digests of content."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import re
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+import tomli_w
+
+from fieldkit.errors import StoreError, suggestion
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+def atomic_write(path: Path, data: bytes | str) -> None:
+    """Write a file so that a reader or a killed process finds the old content or the new, never a part."""
+    path = Path(path)
+    content = data.encode("utf-8") if isinstance(data, str) else data
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror}", hint="choose another --out") from error
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def atomic_folder(path: Path, *, force: bool = False) -> Iterator[Path]:
+    """Yield an empty folder beside ``path`` that takes its place on success and vanishes on failure.
+
+    Raises StoreError when ``path`` exists and ``force`` is not set; it is asked again before the folder is replaced.
+    """
+    path = Path(path)
+    refuse_existing(path, force=force)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        yield work
+        work.chmod(0o755)
+        refuse_existing(path, force=force)
+        _replace(work, path)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _replace(work: Path, path: Path) -> None:
+    if not path.exists():
+        work.rename(path)
+        return
+    # A folder cannot replace a full one in one step: the old one is kept aside until the new one stands.
+    old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old.")) / path.name
+    path.rename(old)
+    try:
+        work.rename(path)
+    except BaseException:
+        old.rename(path)
+        raise
+    finally:
+        shutil.rmtree(old.parent, ignore_errors=True)
+
+
+def refuse_existing(path: Path, *, force: bool) -> None:
+    """Raise StoreError when something stands at ``path`` and may not be replaced."""
+    path = Path(path)
+    if path.is_dir() and not any(path.iterdir()):
+        return
+    if path.exists() and not force:
+        raise StoreError(f"{path}: exists already", hint="give --force to replace it, or choose another --out")
+
+
+def digest(*parts: bytes | str | Path) -> str:
+    """Return the SHA-256 (hex, 32 digits) of byte strings, texts and files in the order given."""
+    total = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            with part.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    total.update(block)
+        else:
+            total.update(part.encode("utf-8") if isinstance(part, str) else part)
+        total.update(b"\0")
+    return total.hexdigest()[:32]
+
+
+def read_text(path: Path, *, what: str) -> str:
+    """Read a text file; raises StoreError when it is missing, not readable, or not text."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise StoreError(f"{path}: no such file; expected {what}", hint="check the path") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise StoreError(f"{path}: cannot be read as text; expected {what}", hint="check the file") from error
+
+
+def read_toml(path: Path, struct: type[T], *, what: str) -> T:
+    """Read a TOML file into a struct; unknown keys, wrong types and newer versions raise StoreError with the place."""
+    text = read_text(path, what=what)
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise StoreError(f"{path}: not valid TOML: {error}; expected {what}", hint="correct the file") from error
+    return convert(values, struct, path=Path(path), what=what)
+
+
+def read_json(path: Path, struct: type[T], *, what: str) -> T:
+    """Read a JSON file into a struct, as strictly as `read_toml`."""
+    try:
+        values = json.loads(read_text(path, what=what))
+    except json.JSONDecodeError as error:
+        raise StoreError(f"{path}: not valid JSON: {error}; expected {what}", hint="correct the file") from error
+    return convert(values, struct, path=Path(path), what=what)
+
+
+def convert(values: Any, struct: type[T], *, path: Path, what: str) -> T:
+    """Check plain values against a struct; errors name the file and the place inside it."""
+    version = values.get("version", 1) if isinstance(values, dict) else 1
+    if isinstance(version, int) and version > 1:
+        raise StoreError(f"{path}: version {version}; this fieldkit reads version 1", hint="update fieldkit")
+    try:
+        return msgspec.convert(values, struct)
+    except msgspec.ValidationError as error:
+        unknown = re.match(r"Object contains unknown field `(.+?)`", str(error))
+        if unknown and " - at " not in str(error):
+            hint = suggestion(unknown.group(1), list(struct.__struct_fields__))
+        else:
+            hint = "correct the file"
+        raise StoreError(f"{path}: {error}; expected {what}", hint=hint) from error
+
+
+def write_toml(path: Path, values: Any) -> None:
+    """Write a struct or plain values as TOML, without keys that are None."""
+    atomic_write(path, tomli_w.dumps(_without_none(plain(values))))
+
+
+def plain(values: Any) -> Any:
+    """Turn structs, arrays and numpy numbers into plain values."""
+
+    def hook(value: Any) -> Any:
+        if isinstance(value, np.ndarray | np.generic):
+            return value.tolist()
+        raise TypeError(f"cannot store {type(value)}")
+
+    return msgspec.to_builtins(values, enc_hook=hook)
+
+
+def plain_json(values: Any) -> str:
+    """Return JSON text without NaN or Infinity: such numbers become null."""
+    return json.dumps(_finite(plain(values)), indent=1, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_none(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(v) for v in value]
+    return value
