@@ -1,6 +1,14 @@
 """Nouns on disk: text files that others read, content digests, and writing that leaves the old or the new."""
 
-from fieldkit.store.files import atomic_folder, atomic_write, digest, plain_json, read_json, read_toml, write_toml
+from fieldkit.store.files import (
+    atomic_folder,
+    atomic_write,
+    digest,
+    plain_json,
+    read_json,
+    read_toml,
+    write_toml,
+)
 from fieldkit.store.inputs import (
     PhotoEntry,
     Rig,

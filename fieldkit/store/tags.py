@@ -53,11 +53,17 @@ def read_tags(path: Path) -> TagMap:
         try:
             tags.append(_tag(entry))
         except FieldkitError as error:
-            raise StoreError(f"{path}: tag[{index}] (id {entry.id}): {error.message}", hint="correct the file") from error
+            raise StoreError(
+                f"{path}: tag[{index}] (id {entry.id}): {error.message}", hint="correct the file"
+            ) from error
     keys = [(t.id, t.visit) for t in tags]
     if len(set(keys)) != len(keys):
-        raise StoreError(f"{path}: a tag is listed twice for the same visit", hint="keep one [[tag]] per id and visit")
-    photos = tuple(TagPhoto(p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma) for p in data.photo)
+        raise StoreError(
+            f"{path}: a tag is listed twice for the same visit", hint="keep one [[tag]] per id and visit"
+        )
+    photos = tuple(
+        TagPhoto(p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma) for p in data.photo
+    )
     return TagMap(tuple(tags), photos, data.map_digest, digest=digest(path), path=str(path))
 
 
@@ -65,7 +71,10 @@ def _tag(entry: _Tag) -> TagPose:
     if len(entry.covariance) != 36:
         raise StoreError(f"covariance has {len(entry.covariance)} numbers; expected 36, row-major")
     covariance = np.asarray(entry.covariance).reshape(6, 6)
-    if not np.isfinite(covariance).all() or np.linalg.eigvalsh((covariance + covariance.T) / 2).min() < -1e-12:
+    if (
+        not np.isfinite(covariance).all()
+        or np.linalg.eigvalsh((covariance + covariance.T) / 2).min() < -1e-12
+    ):
         raise StoreError("covariance is not positive semi-definite")
     map_from_tag = pose(entry.position_m, entry.quaternion_xyzw)
     return TagPose(
@@ -81,7 +90,18 @@ def write_tags(path: Path, tags: TagMap) -> None:
         xyz, quaternion = position_quaternion(t.map_from_tag)
         covariance = [float(v) for v in np.asarray(t.covariance).ravel()]
         entries.append(
-            _Tag(t.id, t.family, t.size_m, xyz, quaternion, covariance, t.n_photos, t.rms_px, t.verdict, t.visit)
+            _Tag(
+                t.id,
+                t.family,
+                t.size_m,
+                xyz,
+                quaternion,
+                covariance,
+                t.n_photos,
+                t.rms_px,
+                t.verdict,
+                t.visit,
+            )
         )
     photos = [_Photo(p.file, p.tag_id, p.used, p.reason, p.ambiguity, p.sigma, p.visit) for p in tags.photos]
     write_toml(path, _TagsFile(1, tags.map_digest, entries, photos))
