@@ -35,19 +35,12 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
-            raise CameraError(
-                f"unknown camera model {self.model!r}", hint=suggestion(self.model, list(MODELS))
-            )
+            raise CameraError(f"unknown camera model {self.model!r}", hint=suggestion(self.model, list(MODELS)))
         if len(self.params) != MODELS[self.model]:
             raise CameraError(
                 f"camera model {self.model} has {len(self.params)} params; expected {MODELS[self.model]} in COLMAP's order"
             )
-        if (
-            self.width <= 0
-            or self.height <= 0
-            or not np.isfinite(self.params).all()
-            or min(self.focal_px) <= 0
-        ):
+        if self.width <= 0 or self.height <= 0 or not np.isfinite(self.params).all() or min(self.focal_px) <= 0:
             raise CameraError(
                 f"camera {self.width}x{self.height} {self.params}; expected positive size and focal length"
             )
@@ -102,9 +95,7 @@ class Camera:
         """Map undistorted normalised coordinates (n, 2) to distorted ones (n, 2)."""
         values = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         return (
-            _distort_fisheye(values, self.params[4:8])
-            if self.is_fisheye
-            else _distort(values, self.opencv_distortion)
+            _distort_fisheye(values, self.params[4:8]) if self.is_fisheye else _distort(values, self.opencv_distortion)
         )
 
     def project(self, x_in_cam: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
@@ -216,9 +207,7 @@ def camera_from_info(
     matrix = np.asarray(k, dtype=np.float64).reshape(3, 3)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     if fx <= 0 or fy <= 0:
-        raise CameraError(
-            f"CameraInfo has focal lengths {fx:g}, {fy:g}; expected a calibrated camera (K set)"
-        )
+        raise CameraError(f"CameraInfo has focal lengths {fx:g}, {fy:g}; expected a calibrated camera (K set)")
     values = [float(v) for v in d]
     head = (float(fx), float(fy), float(cx), float(cy))
     if not any(values):

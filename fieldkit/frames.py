@@ -20,14 +20,10 @@ def pose(position_m: ArrayLike, quaternion_xyzw: ArrayLike) -> Pose:
     xyz = np.asarray(position_m, dtype=np.float64)
     quaternion = np.asarray(quaternion_xyzw, dtype=np.float64)
     if xyz.shape != (3,) or quaternion.shape != (4,):
-        raise FrameError(
-            f"pose has {xyz.shape} position and {quaternion.shape} quaternion; expected (3,) and (4,)"
-        )
+        raise FrameError(f"pose has {xyz.shape} position and {quaternion.shape} quaternion; expected (3,) and (4,)")
     norm = float(np.linalg.norm(quaternion))
     if not np.isfinite(xyz).all() or not np.isfinite(norm) or abs(norm - 1.0) > 0.05:
-        raise FrameError(
-            f"pose is not finite or its quaternion has length {norm:.3g}; expected a unit quaternion"
-        )
+        raise FrameError(f"pose is not finite or its quaternion has length {norm:.3g}; expected a unit quaternion")
     return Pose.from_components(xyz, Rotation.from_quat(quaternion))
 
 
@@ -125,9 +121,7 @@ def mean_pose(poses: Sequence[Pose], *, covariances: Sequence[Array] | None = No
     mean = poses[0]
     for _ in range(10):
         total = np.sum(information, axis=0)
-        step = np.linalg.solve(
-            total, sum(w @ log(mean.inv() * p) for w, p in zip(information, poses, strict=True))
-        )
+        step = np.linalg.solve(total, sum(w @ log(mean.inv() * p) for w, p in zip(information, poses, strict=True)))
         mean = mean * exp(step)
         if float(np.abs(step).max()) < 1e-12:
             break
@@ -169,7 +163,5 @@ class Trajectory:
             raise FrameError(f"{what}: outside of the samples {int(self.t_ns[0])} .. {int(self.t_ns[-1])} ns")
         t0, t1 = int(self.t_ns[right - 1]), int(self.t_ns[right])
         if t1 - t0 > self.max_gap_ns:
-            raise FrameError(
-                f"{what}: inside a gap of {(t1 - t0) / 1e9:.2f} s; at most {self.max_gap_ns / 1e9:.2f} s"
-            )
+            raise FrameError(f"{what}: inside a gap of {(t1 - t0) / 1e9:.2f} s; at most {self.max_gap_ns / 1e9:.2f} s")
         return interpolate(self.poses[right - 1], self.poses[right], (t_ns - t0) / (t1 - t0))

@@ -111,9 +111,7 @@ def from_dict(values: dict[str, Any], *, source: str) -> Protocol:
     """Make a protocol from plain values (of a TOML file or run.json) and check them; errors name ``source``."""
     version = values.get("version", 1)
     if isinstance(version, int) and version > 1:
-        raise ProtocolError(
-            f"{source}: version {version}; this fieldkit reads version 1", hint="update fieldkit"
-        )
+        raise ProtocolError(f"{source}: version {version}; this fieldkit reads version 1", hint="update fieldkit")
     try:
         protocol = msgspec.convert(values, Protocol)
     except msgspec.ValidationError as error:
@@ -137,9 +135,7 @@ def _read(name_or_path: str | Path) -> tuple[str, str]:
     path = Path(name_or_path)
     if path.suffix == ".toml" or path.exists():
         if not path.is_file():
-            raise ProtocolError(
-                f"{path}: no such protocol file", hint=suggestion(str(path), known_protocols())
-            )
+            raise ProtocolError(f"{path}: no such protocol file", hint=suggestion(str(path), known_protocols()))
         return path.read_text(encoding="utf-8"), str(path)
     if str(name_or_path) not in known_protocols():
         raise ProtocolError(
@@ -174,9 +170,7 @@ def _check(protocol: Protocol, source: str) -> None:
     if not protocol.thresholds:
         raise ProtocolError(f"{source}: no thresholds; expected at least one", hint="add [[thresholds]]")
     if len(set(protocol.policies)) != len(protocol.policies):
-        raise ProtocolError(
-            f"{source}: a policy is listed twice in {list(protocol.policies)}", hint="list it once"
-        )
+        raise ProtocolError(f"{source}: a policy is listed twice in {list(protocol.policies)}", hint="list it once")
     for bound in protocol.expect:
         if Threshold(bound.position_m, bound.rotation_deg) not in protocol.thresholds:
             raise ProtocolError(

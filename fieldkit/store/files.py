@@ -32,9 +32,7 @@ def atomic_write(path: Path, data: bytes | str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     except OSError as error:
-        raise StoreError(
-            f"{path}: cannot be written: {error.strerror}", hint="choose another --out"
-        ) from error
+        raise StoreError(f"{path}: cannot be written: {error.strerror}", hint="choose another --out") from error
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(content)
@@ -88,9 +86,7 @@ def refuse_existing(path: Path, *, force: bool) -> None:
     if path.is_dir() and not any(path.iterdir()):
         return
     if path.exists() and not force:
-        raise StoreError(
-            f"{path}: exists already", hint="give --force to replace it, or choose another --out"
-        )
+        raise StoreError(f"{path}: exists already", hint="give --force to replace it, or choose another --out")
 
 
 def digest(*parts: bytes | str | Path) -> str:
@@ -123,9 +119,7 @@ def read_toml(path: Path, struct: type[T], *, what: str) -> T:
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise StoreError(
-            f"{path}: not valid TOML: {error}; expected {what}", hint="correct the file"
-        ) from error
+        raise StoreError(f"{path}: not valid TOML: {error}; expected {what}", hint="correct the file") from error
     return convert(values, struct, path=Path(path), what=what)
 
 
@@ -134,9 +128,7 @@ def read_json(path: Path, struct: type[T], *, what: str) -> T:
     try:
         values = json.loads(read_text(path, what=what))
     except json.JSONDecodeError as error:
-        raise StoreError(
-            f"{path}: not valid JSON: {error}; expected {what}", hint="correct the file"
-        ) from error
+        raise StoreError(f"{path}: not valid JSON: {error}; expected {what}", hint="correct the file") from error
     return convert(values, struct, path=Path(path), what=what)
 
 

@@ -87,9 +87,7 @@ def read_rig(path: Path) -> Rig:
 
 
 def _rig_camera(c: _RigCameraFile) -> RigCamera:
-    return RigCamera(
-        c.name, Camera(c.model, c.width, c.height, tuple(c.params)), pose(c.position_m, c.quaternion_xyzw)
-    )
+    return RigCamera(c.name, Camera(c.model, c.width, c.height, tuple(c.params)), pose(c.position_m, c.quaternion_xyzw))
 
 
 def write_rig(path: Path, rig: Rig) -> None:
@@ -98,9 +96,7 @@ def write_rig(path: Path, rig: Rig) -> None:
     def entry(c: RigCamera) -> _RigCameraFile:
         xyz, quaternion = position_quaternion(c.rig_from_cam)
         camera = c.camera
-        return _RigCameraFile(
-            c.name, camera.model, camera.width, camera.height, list(camera.params), xyz, quaternion
-        )
+        return _RigCameraFile(c.name, camera.model, camera.width, camera.height, list(camera.params), xyz, quaternion)
 
     depth = None if rig.depth is None else entry(rig.depth)
     write_toml(path, _RigFile(1, [entry(c) for c in rig.cameras], depth))

@@ -89,9 +89,7 @@ def write_run(path: Path, run: Run, *, force: bool = False) -> None:
         write_table(folder / "estimates.csv", ESTIMATES, (_result_cells(r) for r in run.results))
         write_table(folder / "truth.csv", TRUTHS, (_truth_cells(s, t) for s, t in run.truths))
         write_table(folder / "priors.csv", PRIORS, (_prior_cells(p) for p in run.plans))
-        write_table(
-            folder / "candidates.csv", CANDIDATES, (row for p in run.plans for row in _candidate_cells(p))
-        )
+        write_table(folder / "candidates.csv", CANDIDATES, (row for p in run.plans for row in _candidate_cells(p)))
         _write_arrays(folder, run)
         _write_poses(folder, run)
         for key, jpeg in run.thumbnails.items():
@@ -103,9 +101,7 @@ def read_run(path: Path) -> Run:
     """Read a run folder; raises StoreError with the file and line of what is missing or damaged."""
     path = Path(path)
     if not (path / "run.json").is_file():
-        raise StoreError(
-            f"{path}: not a run folder; expected run.json in it", hint="make one with `fieldkit replay`"
-        )
+        raise StoreError(f"{path}: not a run folder; expected run.json in it", hint="make one with `fieldkit replay`")
     head = read_json(path / "run.json", _RunFile, what="run.json of a run folder")
     protocol = protocols.from_dict(head.protocol, source=f"{path / 'run.json'}: protocol")
     utilities, plan_view = _read_arrays(path)
@@ -238,9 +234,7 @@ def _candidate_cells(p: VisitPlan) -> list[dict[str, object]]:
     }  # fmt: skip
     return [
         {**shared, "view": view, "kind": kind, "allowed": bool(allowed), **pose_cells(map_from_cam)}
-        for view, kind, allowed, map_from_cam in zip(
-            c.view_ids, c.kinds, c.allowed, c.map_from_cam, strict=True
-        )
+        for view, kind, allowed, map_from_cam in zip(c.view_ids, c.kinds, c.allowed, c.map_from_cam, strict=True)
     ]
 
 
@@ -297,9 +291,7 @@ def _read_arrays(path: Path) -> tuple[dict[tuple[str, str], dict[tuple[str, bool
         with np.load(path / "plan.npz", allow_pickle=False) as archive:
             return utilities, PlanView(archive["landmarks"], archive["cameras"])
     except (OSError, KeyError, ValueError) as error:
-        raise StoreError(
-            f"{path}: utilities.npz or plan.npz: {error}", hint="replay the recording again"
-        ) from error
+        raise StoreError(f"{path}: utilities.npz or plan.npz: {error}", hint="replay the recording again") from error
 
 
 def _write_poses(folder: Path, run: Run) -> None:

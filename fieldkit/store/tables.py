@@ -42,9 +42,7 @@ def read_table(path: Path, columns: Sequence[str], parse: Callable[[Row], R]) ->
         try:
             result.append(parse(row))
         except (ValueError, TypeError, FieldkitError) as error:
-            raise StoreError(
-                f"{path}: line {reader.line_num}: {error}", hint="replay the recording again"
-            ) from error
+            raise StoreError(f"{path}: line {reader.line_num}: {error}", hint="replay the recording again") from error
     return result
 
 

@@ -58,12 +58,8 @@ def read_tags(path: Path) -> TagMap:
             ) from error
     keys = [(t.id, t.visit) for t in tags]
     if len(set(keys)) != len(keys):
-        raise StoreError(
-            f"{path}: a tag is listed twice for the same visit", hint="keep one [[tag]] per id and visit"
-        )
-    photos = tuple(
-        TagPhoto(p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma) for p in data.photo
-    )
+        raise StoreError(f"{path}: a tag is listed twice for the same visit", hint="keep one [[tag]] per id and visit")
+    photos = tuple(TagPhoto(p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma) for p in data.photo)
     return TagMap(tuple(tags), photos, data.map_digest, digest=digest(path), path=str(path))
 
 
@@ -71,10 +67,7 @@ def _tag(entry: _Tag) -> TagPose:
     if len(entry.covariance) != 36:
         raise StoreError(f"covariance has {len(entry.covariance)} numbers; expected 36, row-major")
     covariance = np.asarray(entry.covariance).reshape(6, 6)
-    if (
-        not np.isfinite(covariance).all()
-        or np.linalg.eigvalsh((covariance + covariance.T) / 2).min() < -1e-12
-    ):
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh((covariance + covariance.T) / 2).min() < -1e-12:
         raise StoreError("covariance is not positive semi-definite")
     map_from_tag = pose(entry.position_m, entry.quaternion_xyzw)
     return TagPose(
