@@ -1,0 +1,203 @@
+"""The scene: a textured triangle mesh in the world frame (metres, z up), with rays and free floor."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fieldkit.frames import Pose
+
+if TYPE_CHECKING:
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+Array = NDArray[np.float64]
+Rgb = NDArray[np.uint8]
+
+# A texture smaller than this is enlarged without smoothing, so that the edges of its cells stay sharp in photos.
+MIN_TEXTURE_PX = 1024
+
+
+@dataclasses.dataclass(frozen=True)
+class Mips:
+    """Mip chains of all textures: ``texels`` uint32 packed as blue-green-red, ``levels`` int64[t,l,3].
+
+    A level is its first texel, width and height; width 0 where a texture has no such level.
+    """
+
+    texels: NDArray[np.uint32]
+    levels: NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """A textured mesh. Faces are two-sided; winding carries no meaning.
+
+    ``vertices`` float64[n,3] in m, z up; ``faces`` int32[m,3]; ``uv`` float32[m,3,2] per face corner, (0, 0) at the
+    top left of the texture and v downwards, clamped outside 0..1; ``texture`` int32[m] per face; ``textures`` RGB
+    images; ``shade`` float32[m,3] baked brightness per face corner (1 leaves the texture as it is).
+    ``blocks`` float64[k,8] are the plan-view footprints of what stands on the floor, four corners x, y in turn.
+    ``walk_xy`` float64[j,2] is a closed polyline (the last point leads to the first) through free floor for a
+    mapping walk. ``floor_bounds`` (x0, y0, x1, y1) is the floor's rectangle.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int32]
+    uv: NDArray[np.float32]
+    texture: NDArray[np.int32]
+    textures: tuple[Rgb, ...]
+    shade: NDArray[np.float32]
+    blocks: Array
+    walk_xy: Array
+    floor_bounds: tuple[float, float, float, float]
+    background: tuple[int, int, int] = (128, 128, 128)
+
+    @functools.cached_property
+    def bounds(self) -> Array:
+        """Lowest and highest corner of the mesh, float64[2,3] in m."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @functools.cached_property
+    def mips(self) -> Mips:
+        """Mip chains of the textures, made at first use."""
+        return _mip_chains(self.textures)
+
+    @functools.cached_property
+    def _rays(self) -> RayMeshIntersector:
+        import trimesh
+        from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+        mesh = trimesh.Trimesh(self.vertices, self.faces, process=False, validate=False)
+        return RayMeshIntersector(mesh, scale_to_box=False)
+
+    def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Array:
+        """Return the distance f64[n] in m along rays (n, 3) to the first surface, inf where there is none.
+
+        Directions need not have unit length; the distance is metric. The face is found by Embree (single precision)
+        and the distance computed from its plane in double precision.
+        """
+        start = np.atleast_2d(np.asarray(origins, dtype=np.float64))
+        ray = np.atleast_2d(np.asarray(directions, dtype=np.float64))
+        start, ray = np.broadcast_arrays(start, ray)
+        unit = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        face = self._rays.intersects_first(start, unit)
+        hit = face >= 0
+        a, b, c = (self.vertices[self.faces[face[hit], i]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        distance = np.full(len(start), np.inf)
+        distance[hit] = ((a - start[hit]) * normal).sum(axis=1) / (unit[hit] * normal).sum(axis=1)
+        return distance
+
+    def free_floor(self, xy: ArrayLike, radius_m: float) -> NDArray[np.bool_]:
+        """Return bool[n]: whether a disc of this radius around points (n, 2) touches neither furniture nor walls."""
+        points = np.atleast_2d(np.asarray(xy, dtype=np.float64))
+        x0, y0, x1, y1 = self.floor_bounds
+        low, high = np.array([x0, y0]) + radius_m, np.array([x1, y1]) - radius_m
+        free = ((points >= low) & (points <= high)).all(axis=1)
+        for block in self.blocks:
+            free &= _distance_to_block(points, block.reshape(4, 2)) >= radius_m
+        return free
+
+    def with_quad(self, world_from_quad: Pose, width_m: float, height_m: float, texture: Rgb) -> Scene:
+        """Return the scene with a textured rectangle centred on a pose: x right, y up, facing +z.
+
+        The texture's first row is at the top (+y), and its borders are exactly the rectangle's. It is drawn from
+        both sides: put a box behind it. ``texture`` is grey (h, w) or RGB (h, w, 3), uint8.
+        """
+        x, y = width_m / 2, height_m / 2
+        corners = np.array([[-x, y, 0.0], [x, y, 0.0], [x, -y, 0.0], [-x, -y, 0.0]])
+        uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        return self._with_quads(world_from_quad.apply(corners)[None], uv[None], _enlarged(texture), 1.0)
+
+    def with_box(self, world_from_box: Pose, size_m: ArrayLike, *, rgb: tuple[int, int, int]) -> Scene:
+        """Return the scene with a box of one colour centred on a pose, of size (x, y, z) in m; no footprint."""
+        half = np.asarray(size_m, dtype=np.float64) / 2
+        quads = box_quads()[0] * half
+        corners = world_from_box.apply(quads.reshape(-1, 3)).reshape(6, 4, 3)
+        normals = world_from_box.rotation.apply(quads.mean(axis=1) / half)
+        uv = np.tile(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (6, 1, 1))
+        shade = 0.78 + 0.2 * normals[:, 2] - 0.05 * normals[:, 0]
+        return self._with_quads(corners, uv, np.full((1, 1, 3), rgb, np.uint8), shade[:, None])
+
+    def with_block(self, corners_xy: ArrayLike) -> Scene:
+        """Return the scene with a further footprint, four corners (4, 2) in turn, that `free_floor` avoids."""
+        block = np.asarray(corners_xy, dtype=np.float64).reshape(1, 8)
+        return dataclasses.replace(self, blocks=np.concatenate([self.blocks, block]))
+
+    def _with_quads(self, corners: Array, uv: Array, texture: Rgb, shade: float | Array) -> Scene:
+        count = len(corners)
+        first = len(self.vertices) + 4 * np.arange(count)[:, None]
+        faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+        corner_uv = np.concatenate([uv[:, [0, 1, 2]], uv[:, [0, 2, 3]]])
+        values = np.broadcast_to(shade, (count, 3))
+        return dataclasses.replace(
+            self,
+            vertices=np.concatenate([self.vertices, corners.reshape(-1, 3)]),
+            faces=np.concatenate([self.faces, faces.astype(np.int32)]),
+            uv=np.concatenate([self.uv, corner_uv.astype(np.float32)]),
+            texture=np.concatenate([self.texture, np.full(2 * count, len(self.textures), np.int32)]),
+            textures=(*self.textures, texture),
+            shade=np.concatenate([self.shade, np.tile(values, (2, 1)).astype(np.float32)]),
+        )
+
+
+def box_quads() -> tuple[Array, Array]:
+    """Return the six sides of the cube -1..1: corners f64[6,4,3] (top left first, clockwise from outside), normals."""
+    sides = {
+        (1, 0, 0): [(1, -1, 1), (1, 1, 1), (1, 1, -1), (1, -1, -1)],
+        (-1, 0, 0): [(-1, 1, 1), (-1, -1, 1), (-1, -1, -1), (-1, 1, -1)],
+        (0, 1, 0): [(1, 1, 1), (-1, 1, 1), (-1, 1, -1), (1, 1, -1)],
+        (0, -1, 0): [(-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)],
+        (0, 0, 1): [(-1, 1, 1), (1, 1, 1), (1, -1, 1), (-1, -1, 1)],
+        (0, 0, -1): [(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)],
+    }
+    return np.array(list(sides.values()), dtype=np.float64), np.array(list(sides), dtype=np.float64)
+
+
+def _enlarged(texture: Rgb) -> Rgb:
+    image = texture if texture.ndim == 3 else np.repeat(texture[:, :, None], 3, axis=2)
+    factor = 1
+    while max(image.shape[:2]) * factor < MIN_TEXTURE_PX:
+        factor *= 2
+    return np.ascontiguousarray(np.repeat(np.repeat(image, factor, axis=0), factor, axis=1))
+
+
+def _mip_chains(textures: tuple[Rgb, ...]) -> Mips:
+    """Halve every texture down to one texel by exact area averages, in gamma space.
+
+    Averages of linear light would move black-white edges by a quarter of a pixel and so bias the size of tags.
+    """
+    chunks: list[NDArray[np.uint32]] = []
+    rows: list[list[tuple[int, int, int]]] = []
+    start = 0
+    for image in textures:
+        level = image.astype(np.float32)
+        rows.append([])
+        while True:
+            packed = np.rint(level).astype(np.uint32)
+            chunks.append((packed[..., 0] | packed[..., 1] << 8 | packed[..., 2] << 16).ravel())
+            height, width = level.shape[:2]
+            rows[-1].append((start, width, height))
+            start += width * height
+            if width == 1 and height == 1:
+                break
+            level = cv2.resize(level, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
+    levels = np.zeros((len(textures), max(map(len, rows)), 3), np.int64)
+    for i, row in enumerate(rows):
+        levels[i, : len(row)] = row
+    return Mips(np.concatenate(chunks), levels)
+
+
+def _distance_to_block(points: Array, corners: Array) -> Array:
+    """Return the distance f64[n] of points (n, 2) to a convex polygon (k, 2); 0 inside."""
+    edges = np.roll(corners, -1, axis=0) - corners
+    delta = points[:, None] - corners[None]
+    along = np.clip((delta * edges).sum(axis=2) / (edges**2).sum(axis=1), 0.0, 1.0)
+    distance = np.linalg.norm(delta - along[..., None] * edges, axis=2).min(axis=1)
+    side = edges[:, 0] * delta[..., 1] - edges[:, 1] * delta[..., 0]
+    inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
+    return np.where(inside, 0.0, distance)

@@ -1,0 +1,412 @@
+"""Numba kernels of the rasteriser: triangle setup, binning, visibility and texturing of pinhole images.
+
+A triangle is rasterised in 2-D homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous
+coordinates", 1997), so nothing is clipped. With p_i = K x_i the edge functions are e_0 = p_1 x p_2 and cyclically; a pixel
+q = (u, v, 1) lies inside when all e_i . q have the sign of det [p_0 p_1 p_2], and 1 / z = sum(e_i) . q / det there.
+Two triangles that share an edge compute exactly negated edge functions, so no sample falls between them.
+
+fastmath stays off and every tile is written by one thread alone: any number of threads gives the same bits.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+TILE = 32
+NEAR_M = 1e-3
+MAX_TAPS = 8
+LOD_BIAS = -0.5
+
+# The rotated grid, then the centre: sample k of a pixel lies at its centre plus (DX[k], DY[k]).
+_DX = (-0.125, 0.375, 0.125, -0.375, 0.0)
+_DY = (-0.375, -0.125, 0.375, 0.125, 0.0)
+# No sample lies further than this from the pixel centre along either axis.
+_REACH = 0.375
+
+
+@njit(cache=True)
+def _transform(vertices: NDArray, matrix: NDArray) -> NDArray:
+    out = np.empty((vertices.shape[0], 3))
+    for i in range(vertices.shape[0]):
+        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        for r in range(3):
+            out[i, r] = matrix[r, 0] * x + matrix[r, 1] * y + matrix[r, 2] * z + matrix[r, 3]
+    return out
+
+
+@njit(cache=True)
+def _bounds(p: NDArray, face: NDArray, limit: float) -> tuple[float, float, float, float]:
+    """Return the pixel bounds (x0, y0, x1, y1) of the part of a triangle beyond the near plane."""
+    x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(3):
+        a = face[i]
+        b = face[(i + 1) % 3]
+        za, zb = p[a, 2], p[b, 2]
+        if za >= NEAR_M:
+            x, y = p[a, 0] / za, p[a, 1] / za
+            x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
+        if (za < NEAR_M) != (zb < NEAR_M):
+            s = (NEAR_M - za) / (zb - za)
+            x = (p[a, 0] + s * (p[b, 0] - p[a, 0])) / NEAR_M
+            y = (p[a, 1] + s * (p[b, 1] - p[a, 1])) / NEAR_M
+            x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
+    return max(x0, -limit), max(y0, -limit), min(x1, limit), min(y1, limit)
+
+
+@njit(cache=True)
+def setup(
+    vertices: NDArray,
+    faces: NDArray,
+    uv: NDArray,
+    shade: NDArray,
+    matrix: NDArray,
+    width: int,
+    height: int,
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Set up the triangles that may touch the image.
+
+    vertices f64[n,3]; faces i32[m,3]; uv f32[m,3,2]; shade f32[m,3]; matrix f64[3,4] = K cam_from_world.
+    Returns planes f64[k,21] (three edges, 1/z, u/z, v/z, shade/z; each a, b, c of a*x + b*y + c), boxes i32[k,4]
+    (first and last pixel column and row: x0, y0, x1, y1) and the index of the face i32[k].
+    """
+    p = _transform(vertices, matrix)
+    m = faces.shape[0]
+    planes = np.empty((m, 21))
+    boxes = np.empty((m, 4), np.int32)
+    source = np.empty(m, np.int32)
+    edges = np.empty((3, 3))
+    k = 0
+    limit = 1e6
+    for f in range(m):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if p[a, 2] < NEAR_M and p[b, 2] < NEAR_M and p[c, 2] < NEAR_M:
+            continue
+        x0, y0, x1, y1 = _bounds(p, faces[f], limit)
+        if x1 < 0.0 or y1 < 0.0 or x0 >= width or y0 >= height:
+            continue
+        for i in range(3):
+            s, t = faces[f, (i + 1) % 3], faces[f, (i + 2) % 3]
+            edges[i, 0] = p[s, 1] * p[t, 2] - p[s, 2] * p[t, 1]
+            edges[i, 1] = p[s, 2] * p[t, 0] - p[s, 0] * p[t, 2]
+            edges[i, 2] = p[s, 0] * p[t, 1] - p[s, 1] * p[t, 0]
+        det = p[a, 0] * edges[0, 0] + p[a, 1] * edges[0, 1] + p[a, 2] * edges[0, 2]
+        if det == 0.0:
+            continue
+        sign = 1.0 if det > 0.0 else -1.0
+        size = abs(det)
+        for j in range(3):
+            e0, e1, e2 = sign * edges[0, j], sign * edges[1, j], sign * edges[2, j]
+            planes[k, j] = e0
+            planes[k, 3 + j] = e1
+            planes[k, 6 + j] = e2
+            planes[k, 9 + j] = (e0 + e1 + e2) / size
+            planes[k, 12 + j] = (e0 * uv[f, 0, 0] + e1 * uv[f, 1, 0] + e2 * uv[f, 2, 0]) / size
+            planes[k, 15 + j] = (e0 * uv[f, 0, 1] + e1 * uv[f, 1, 1] + e2 * uv[f, 2, 1]) / size
+            planes[k, 18 + j] = (e0 * shade[f, 0] + e1 * shade[f, 1] + e2 * shade[f, 2]) / size
+        boxes[k, 0] = max(0, int(math.floor(x0)))
+        boxes[k, 1] = max(0, int(math.floor(y0)))
+        boxes[k, 2] = min(width - 1, int(math.floor(x1)))
+        boxes[k, 3] = min(height - 1, int(math.floor(y1)))
+        source[k] = f
+        k += 1
+    return planes[:k].copy(), boxes[:k].copy(), source[:k].copy()
+
+
+@njit(cache=True)
+def _misses(plane: NDArray, x0: float, y0: float, x1: float, y1: float) -> bool:
+    """Return whether a triangle lies wholly outside a rectangle, judged by its edges (may return False for a miss)."""
+    for i in range(3):
+        a, b, c = plane[3 * i], plane[3 * i + 1], plane[3 * i + 2]
+        x = x1 if a > 0.0 else x0
+        y = y1 if b > 0.0 else y0
+        if a * x + b * y + c < 0.0:
+            return True
+    return False
+
+
+@njit(cache=True)
+def bin_tiles(planes: NDArray, boxes: NDArray, width: int, height: int) -> tuple[NDArray, NDArray]:
+    """Sort triangles into tiles, in the order of the faces: starts i64[tiles+1] and the triangle list i32[...]."""
+    across = (width + TILE - 1) // TILE
+    down = (height + TILE - 1) // TILE
+    starts = np.zeros(across * down + 1, np.int64)
+    fill = np.zeros(across * down, np.int64)
+    members = np.empty(0, np.int32)
+    for step in range(2):
+        for k in range(boxes.shape[0]):
+            tx0, tx1 = boxes[k, 0] // TILE, boxes[k, 2] // TILE
+            ty0, ty1 = boxes[k, 1] // TILE, boxes[k, 3] // TILE
+            many = tx1 > tx0 or ty1 > ty0
+            for ty in range(ty0, ty1 + 1):
+                for tx in range(tx0, tx1 + 1):
+                    x, y = float(tx * TILE), float(ty * TILE)
+                    if many and _misses(planes[k], x, y, x + TILE, y + TILE):
+                        continue
+                    tile = ty * across + tx
+                    if step == 0:
+                        starts[tile + 1] += 1
+                    else:
+                        members[fill[tile]] = k
+                        fill[tile] += 1
+        if step == 0:
+            for tile in range(across * down):
+                starts[tile + 1] += starts[tile]
+                fill[tile] = starts[tile]
+            members = np.empty(starts[across * down], np.int32)
+    return starts, members
+
+
+@njit(cache=True)
+def _clamped(value: float, low: int, high: int) -> int:
+    if value <= low:
+        return low
+    if value >= high:
+        return high
+    return int(value)
+
+
+@njit(cache=True)
+def _row_spans(plane: NDArray, y: float, first: int, stop: int) -> tuple[int, int, int, int]:
+    """Return columns [lo, hi) that a triangle may touch in the row at y, and [inner_lo, inner_hi) that it covers wholly."""
+    lo, hi, inner_lo, inner_hi = first, stop, first, stop
+    for i in range(3):
+        a, b = plane[3 * i], plane[3 * i + 1]
+        r = b * y + plane[3 * i + 2]
+        m = _REACH * (abs(a) + abs(b))
+        if a > 0.0:
+            lo = max(lo, _clamped(math.floor((-r - m) / a - 0.5 - 1e-6), first, stop))
+            inner_lo = max(inner_lo, _clamped(math.ceil((-r + m) / a - 0.5 + 1e-6), first, stop))
+        elif a < 0.0:
+            hi = min(hi, _clamped(math.floor((-r - m) / a - 0.5 + 1e-6) + 1.0, first, stop))
+            inner_hi = min(inner_hi, _clamped(math.ceil((-r + m) / a - 0.5 - 1e-6), first, stop))
+        else:
+            if r + m < 0.0:
+                hi = lo
+            if r - m < 0.0:
+                inner_hi = inner_lo
+    if inner_hi <= inner_lo:
+        return lo, hi, hi, hi
+    return lo, hi, inner_lo, inner_hi
+
+
+@njit(cache=True)
+def _partial(plane: NDArray, k: int, x: int, y: int, col: int, row: int, w_max: NDArray, owner: NDArray) -> None:
+    """Test the five samples of one pixel against the edges and the nearest surface so far."""
+    for s in range(5):
+        u = x + 0.5 + _DX[s]
+        v = y + 0.5 + _DY[s]
+        if plane[0] * u + plane[1] * v + plane[2] < 0.0:
+            continue
+        if plane[3] * u + plane[4] * v + plane[5] < 0.0:
+            continue
+        if plane[6] * u + plane[7] * v + plane[8] < 0.0:
+            continue
+        w = plane[9] * u + (plane[10] * v + plane[11])
+        if w > w_max[s, row, col]:
+            w_max[s, row, col] = w
+            owner[s, row, col] = k
+
+
+@njit(cache=True)
+def _cover(plane: NDArray, k: int, box: NDArray, tile: tuple, w_max: NDArray, owner: NDArray) -> None:
+    """Enter one triangle into the visibility buffer of a tile (x0, y0, x1, y1)."""
+    tx, ty, tx1, ty1 = tile
+    first, stop = max(box[0], tx), min(box[2] + 1, tx1)
+    for y in range(max(box[1], ty), min(box[3] + 1, ty1)):
+        lo, hi, inner_lo, inner_hi = _row_spans(plane, y + 0.5, first, stop)
+        row = y - ty
+        for x in range(lo, min(inner_lo, hi)):
+            _partial(plane, k, x, y, x - tx, row, w_max, owner)
+        for x in range(max(inner_hi, lo), hi):
+            _partial(plane, k, x, y, x - tx, row, w_max, owner)
+        for s in range(5):
+            # The same order of sums as in _partial: a surface has one depth whichever way a sample is reached.
+            base = plane[10] * (y + 0.5 + _DY[s]) + plane[11]
+            for x in range(inner_lo, inner_hi):
+                w = plane[9] * (x + 0.5 + _DX[s]) + base
+                nearer = w > w_max[s, row, x - tx]
+                w_max[s, row, x - tx] = w if nearer else w_max[s, row, x - tx]
+                owner[s, row, x - tx] = k if nearer else owner[s, row, x - tx]
+
+
+@njit(cache=True)
+def _bilinear(texels: NDArray, start: int, width: int, height: int, u: float, v: float) -> tuple:
+    """Return red, green, blue 0..255 of one mip level at (u, v) in 0..1, clamped at its border."""
+    x = u * width - 0.5
+    y = v * height - 0.5
+    x = min(max(x, 0.0), width - 1.0)
+    y = min(max(y, 0.0), height - 1.0)
+    x0, y0 = int(x), int(y)
+    x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
+    fx, fy = x - x0, y - y0
+    p00, p10 = int(texels[start + y0 * width + x0]), int(texels[start + y0 * width + x1])
+    p01, p11 = int(texels[start + y1 * width + x0]), int(texels[start + y1 * width + x1])
+    w00, w10, w01, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
+    return (
+        w00 * (p00 & 255) + w10 * (p10 & 255) + w01 * (p01 & 255) + w11 * (p11 & 255),
+        w00 * (p00 >> 8 & 255) + w10 * (p10 >> 8 & 255) + w01 * (p01 >> 8 & 255) + w11 * (p11 >> 8 & 255),
+        w00 * (p00 >> 16 & 255) + w10 * (p10 >> 16 & 255) + w01 * (p01 >> 16 & 255) + w11 * (p11 >> 16 & 255),
+    )
+
+
+@njit(cache=True)
+def _footprint(ux: float, vx: float, uy: float, vy: float) -> tuple[float, float, float, float]:
+    """Return the axes of a pixel in texels: long and short length, and the unit direction of the long one.
+
+    The columns of J = [[ux, uy], [vx, vy]] are steps of the texture for one pixel right and down; the axes are the
+    singular values of J and its first left singular vector.
+    """
+    a, b, d = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
+    mean, half = 0.5 * (a + d), 0.5 * (a - d)
+    root = math.sqrt(half * half + b * b)
+    long = math.sqrt(mean + root)
+    short = abs(ux * vy - uy * vx) / long if long > 0.0 else 0.0
+    # Of the two columns of J J^T - short^2, both along the long axis, the one that does not vanish.
+    dx, dy = (half + root, b) if half >= 0.0 else (b, root - half)
+    norm = math.sqrt(dx * dx + dy * dy)
+    if norm > 0.0:
+        return long, short, dx / norm, dy / norm
+    return long, short, 1.0, 0.0
+
+
+@njit(cache=True)
+def _texture(texels: NDArray, levels: NDArray, u: float, v: float, j: tuple) -> tuple:
+    """Filter a texture at (u, v): trilinear, with up to MAX_TAPS taps along the longer axis of the footprint.
+
+    levels i64[l,3] (start, width, height; width 0 where a level does not exist); j = du/dx, dv/dx, du/dy, dv/dy.
+    """
+    width, height = levels[0, 1], levels[0, 2]
+    long, short, dx, dy = _footprint(j[0] * width, j[1] * height, j[2] * width, j[3] * height)
+    if long > MAX_TAPS * short:
+        taps = MAX_TAPS
+    else:
+        taps = max(1, int(math.ceil(long / short - 0.01)))
+    lod = math.log2(max(long / taps, 1e-9)) + LOD_BIAS
+    last = levels.shape[0] - 1
+    while levels[last, 1] == 0:
+        last -= 1
+    lod = min(max(lod, 0.0), float(last))
+    low = min(int(lod), last)
+    blend = lod - low
+    red = green = blue = 0.0
+    for k in range(taps):
+        along = long * ((k + 0.5) / taps - 0.5)
+        s, t = u + along * dx / width, v + along * dy / height
+        r, g, b = _bilinear(texels, levels[low, 0], levels[low, 1], levels[low, 2], s, t)
+        if blend > 0.0:
+            r1, g1, b1 = _bilinear(texels, levels[low + 1, 0], levels[low + 1, 1], levels[low + 1, 2], s, t)
+            r, g, b = r + blend * (r1 - r), g + blend * (g1 - g), b + blend * (b1 - b)
+        red, green, blue = red + r, green + g, blue + b
+    return red / taps, green / taps, blue / taps
+
+
+@njit(cache=True)
+def _shade(plane: NDArray, x: float, y: float, texels: NDArray, levels: NDArray) -> tuple:
+    """Return red, green, blue 0..255 of a triangle seen at pixel position (x, y)."""
+    w = plane[9] * x + plane[10] * y + plane[11]
+    u = (plane[12] * x + plane[13] * y + plane[14]) / w
+    v = (plane[15] * x + plane[16] * y + plane[17]) / w
+    light = (plane[18] * x + plane[19] * y + plane[20]) / w
+    j = (
+        (plane[12] - u * plane[9]) / w,
+        (plane[15] - v * plane[9]) / w,
+        (plane[13] - u * plane[10]) / w,
+        (plane[16] - v * plane[10]) / w,
+    )
+    red, green, blue = _texture(texels, levels, u, v, j)
+    return light * red, light * green, light * blue
+
+
+@njit(cache=True)
+def _pixel(owner: NDArray, row: int, col: int, samples: int) -> tuple[int, int, float, float]:
+    """Take the next surface that owns samples of a pixel: its index (-1 none), the count and the mean offset.
+
+    The samples taken are marked with -2. Shading at the mean of the covered samples keeps off a texture's outside.
+    """
+    first = 4 if samples == 1 else 0
+    found, count, dx, dy = -2, 0, 0.0, 0.0
+    for s in range(first, first + samples):
+        k = owner[s, row, col]
+        if k == -2 or (count > 0 and k != found):
+            continue
+        found = k
+        count += 1
+        dx += _DX[s]
+        dy += _DY[s]
+        owner[s, row, col] = -2
+    return found, count, dx / max(count, 1), dy / max(count, 1)
+
+
+@njit(cache=True)
+def _resolve(
+    tile: tuple,
+    samples: int,
+    planes: NDArray,
+    texture_of: NDArray,
+    texels: NDArray,
+    levels: NDArray,
+    background: NDArray,
+    w_max: NDArray,
+    owner: NDArray,
+    rgb: NDArray,
+    depth: NDArray,
+    seen: NDArray,
+) -> None:
+    """Shade the visibility buffer of a tile into the image."""
+    tx, ty, tx1, ty1 = tile
+    for y in range(ty, ty1):
+        for x in range(tx, tx1):
+            row, col = y - ty, x - tx
+            depth[y, x] = 1.0 / w_max[4, row, col] if w_max[4, row, col] > 0.0 else 0.0
+            seen[y, x] = owner[4, row, col]
+            red = green = blue = 0.0
+            done = 0
+            while done < samples:
+                k, count, dx, dy = _pixel(owner, row, col, samples)
+                if k < 0:
+                    r, g, b = background[0], background[1], background[2]
+                else:
+                    at_x, at_y = x + 0.5 + dx, y + 0.5 + dy
+                    r, g, b = _shade(planes[k], at_x, at_y, texels, levels[texture_of[k]])
+                red, green, blue = red + count * r, green + count * g, blue + count * b
+                done += count
+            rgb[y, x, 0] = np.uint8(min(255.0, red / samples + 0.5))
+            rgb[y, x, 1] = np.uint8(min(255.0, green / samples + 0.5))
+            rgb[y, x, 2] = np.uint8(min(255.0, blue / samples + 0.5))
+
+
+@njit(cache=True, parallel=True)
+def draw(
+    planes: NDArray,
+    boxes: NDArray,
+    texture_of: NDArray,
+    starts: NDArray,
+    members: NDArray,
+    texels: NDArray,
+    levels: NDArray,
+    background: NDArray,
+    width: int,
+    height: int,
+    samples: int,
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Draw binned triangles: rgb u8[h,w,3], depth f32[h,w] along the camera's axis (0 where nothing is) and the
+    triangle i32[h,w] at each pixel centre (-1 where none is).
+
+    texture_of i32[k] per triangle; texels u32[...] packed blue-green-red; levels i64[t,l,3] per texture and mip
+    level (start, width, height); samples 4 (rotated grid) or 1 (pixel centre).
+    """
+    rgb = np.empty((height, width, 3), np.uint8)
+    depth = np.empty((height, width), np.float32)
+    seen = np.empty((height, width), np.int32)
+    across = (width + TILE - 1) // TILE
+    for tile in prange(starts.shape[0] - 1):
+        tx, ty = (tile % across) * TILE, (tile // across) * TILE
+        area = (tx, ty, min(tx + TILE, width), min(ty + TILE, height))
+        w_max = np.zeros((5, TILE, TILE))
+        owner = np.full((5, TILE, TILE), -1, np.int32)
+        for i in range(starts[tile], starts[tile + 1]):
+            _cover(planes[members[i]], members[i], boxes[members[i]], area, w_max, owner)
+        _resolve(area, samples, planes, texture_of, texels, levels, background, w_max, owner, rgb, depth, seen)
+    return rgb, depth, seen
