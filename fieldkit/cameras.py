@@ -38,7 +38,7 @@ class Camera:
             raise CameraError(f"unknown camera model {self.model!r}", hint=suggestion(self.model, list(MODELS)))
         if len(self.params) != MODELS[self.model]:
             raise CameraError(
-                f"camera model {self.model} has {len(self.params)} params; expected {MODELS[self.model]} in COLMAP's order"
+                f"camera model {self.model} has {len(self.params)} params; expected {MODELS[self.model]} as in COLMAP"
             )
         if self.width <= 0 or self.height <= 0 or not np.isfinite(self.params).all() or min(self.focal_px) <= 0:
             raise CameraError(

@@ -47,9 +47,12 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """An interval in which the robot stands in front of a start tag; ``visit`` names the only visit it serves."""
+    """An interval in which the robot stands where it knows its pose; ``visit`` names the only visit that it serves.
 
-    tag_id: int
+    ``tag_id`` is the start tag that it sees there; None where the recording's reference topic gives the start pose.
+    """
+
+    tag_id: int | None
     t_begin_ns: int
     t_end_ns: int
     visit: str | None = None
@@ -191,7 +194,7 @@ class LandmarkStatistics:
 
 @dataclasses.dataclass(frozen=True)
 class Prior:
-    """Where the robot believes its body is at a waypoint: pose, 6x6 covariance, metres travelled since the start tag."""
+    """Where the robot believes its body is at a waypoint: pose, 6x6 covariance, metres travelled since the start."""
 
     visit: str
     map_from_body: Pose

@@ -47,6 +47,7 @@ __all__ = [
     "read_tags",
     "read_toml",
     "read_tum",
+    "refuse_existing",
     "write_camera",
     "write_photos",
     "write_rig",

@@ -126,11 +126,11 @@ def write_photos(path: Path, photos: Iterable[PhotoEntry]) -> None:
 
 
 class SessionStart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """[[start]]: standing at a start tag."""
+    """[[start]]: standing at a start tag, or, without tag_id, where the reference topic gives the start pose."""
 
-    tag_id: int
     t_begin_ns: int
     t_end_ns: int
+    tag_id: int | None = None
     visit: str | None = None
 
 

@@ -1,0 +1,347 @@
+"""The main line: record once, localize every view once, let every policy choose among the same views.
+
+recording -> prior at each visit -> candidate views at the prior -> utilities -> trials
+                                    the same views' images -> estimates ----------^
+                                    tripod tag or pose topic -> truth ------------^
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fieldkit import maps, policies, scores, store
+from fieldkit.bags import open_recording
+from fieldkit.errors import FrameError, PriorError, ReplayError, TruthError
+from fieldkit.frames import pose_error
+from fieldkit.localize import Localizer
+from fieldkit.prior import estimate_prior
+from fieldkit.protocol import Protocol
+from fieldkit.surface import RayCaster
+from fieldkit.truth import estimate_truths
+from fieldkit.types import (
+    Candidates,
+    Estimate,
+    Excluded,
+    Image,
+    PlanView,
+    Prior,
+    Recording,
+    Run,
+    SceneMap,
+    TagMap,
+    Trial,
+    Truth,
+    View,
+    ViewResult,
+    VisitPlan,
+)
+from fieldkit.views import forward_directions, landmark_statistics, recorded_candidates
+
+log = logging.getLogger(__name__)
+Progress = Callable[[str, int, int], None]
+THUMBNAIL_PX = 240
+PLAN_LANDMARKS = 6000
+LIBRARIES = ("fieldkit", "numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "pupil-apriltags", "rosbags")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Session:
+    """What one recording yields."""
+
+    trials: tuple[Trial, ...] = ()
+    results: tuple[ViewResult, ...] = ()
+    truths: tuple[Truth, ...] = ()
+    plans: tuple[VisitPlan, ...] = ()
+    thumbnails: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
+    excluded: tuple[Excluded, ...] = ()
+
+
+def replay(
+    recordings: Sequence[Path],
+    *,
+    map_path: Path,
+    protocol: Protocol,
+    out: Path,
+    tags_path: Path | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Run:
+    """Replay recordings through every policy of a protocol and write the run folder ``out``.
+
+    Views are localized once and kept in a cache beside ``out`` until the run is complete, so that a second start
+    after a kill resumes. Raises FieldkitError where map, tags, recordings and protocol do not fit together; a visit
+    without prior or truth is excluded with its reason.
+    """
+    store.refuse_existing(Path(out), force=force)
+    for name in protocol.policies:
+        if name not in policies.NOT_RANKED:
+            policies.available(name)
+    if not recordings:
+        raise ReplayError("no recording given; expected at least one", hint="name a bag or a session folder")
+    scene_map = maps.load_map(map_path)
+    check_map(scene_map, protocol)
+    tags = _load_tags(tags_path, scene_map)
+    cache = store.EstimateCache(Path(out).parent / f".{Path(out).name}.estimates.jsonl")
+    opened = [open_recording(path) for path in recordings]
+    _check_names(opened)
+    sessions = [_replay_session(r, scene_map, tags, protocol, cache=cache, progress=progress) for r in opened]
+    run = _collect(opened, sessions, scene_map=scene_map, tags=tags, protocol=protocol)
+    if not run.trials:
+        reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3])
+        raise ReplayError(f"{recordings[0]}: no visit could be scored: {reasons}", hint="see the reasons")
+    store.write_run(out, run, force=force)
+    cache.remove()
+    return run
+
+
+def check_map(scene_map: SceneMap, protocol: Protocol) -> None:
+    """Raise ReplayError when a map cannot serve a protocol: another feature, or no surface to test occlusion."""
+    if scene_map.feature != protocol.feature:
+        raise ReplayError(
+            f"{scene_map.path}: made with feature {scene_map.feature!r}; the protocol {protocol.name} expects "
+            f"{protocol.feature!r}",
+            hint=f"build the map with --feature {protocol.feature}, or change the protocol",
+        )
+    counting = [p for p in protocol.policies if p in policies.POLICIES and policies.POLICIES[p].counts_landmarks]
+    if counting and True in protocol.occlusion.use and scene_map.surface is None:
+        raise ReplayError(
+            f"{scene_map.path}: has no surface; expected surface.ply, since the protocol {protocol.name} asks for the "
+            "occlusion filter",
+            hint="build the map with depth images, or set occlusion.use = [false] in the protocol",
+        )
+
+
+def _load_tags(path: Path | None, scene_map: SceneMap) -> TagMap:
+    if path is None:
+        return TagMap((), (), scene_map.digest)
+    tags = store.read_tags(path)
+    if tags.map_digest != scene_map.digest:
+        raise ReplayError(
+            f"{path}: calibrated in the map {tags.map_digest[:12]}; expected {scene_map.digest[:12]}, the digest of "
+            f"{scene_map.path}",
+            hint="calibrate the tags in this map",
+        )
+    return tags
+
+
+def _check_names(recordings: Sequence[Recording]) -> None:
+    names = [r.name for r in recordings]
+    for r in recordings:
+        if names.count(r.name) > 1:
+            raise ReplayError(f"{r.path}: the session {r.name!r} is given twice", hint="give each recording once")
+
+
+def _check_tags(recording: Recording, tags: TagMap) -> None:
+    """Raise ReplayError for a tag that the recording names and the tag file lacks, before any work is done."""
+    wanted = [(s.tag_id, s.visit, "start tag") for s in recording.starts if s.tag_id is not None]
+    if recording.reference is None:
+        wanted += [(v.truth_tag_id, v.id, "tripod tag") for v in recording.visits if v.truth_tag_id is not None]
+    known = sorted({t.id for t in tags.tags})
+    for tag_id, visit, what in wanted:
+        if tags.find(tag_id, visit=visit) is None:
+            where = tags.path or "no tag file was given, and"
+            raise ReplayError(
+                f"{where} has no tag {tag_id}, the {what} of visit {visit} in {recording.path}; expected one of {known}",
+                hint="photograph and calibrate this tag, or correct the tag id of the recording",
+            )
+
+
+def _replay_session(
+    recording: Recording,
+    scene_map: SceneMap,
+    tags: TagMap,
+    protocol: Protocol,
+    *,
+    cache: store.EstimateCache,
+    progress: Progress | None,
+) -> _Session:
+    _check_tags(recording, tags)
+    for warning in recording.warnings:
+        log.warning("%s: %s", recording.path, warning)
+    priors, truths, excluded = _priors_and_truths(recording, tags, protocol)
+    visits = [v for v in recording.visits if v.id in priors]
+    forward = forward_directions(visits, [priors[v.id] for v in visits], rules=protocol.candidates)
+    localizer = Localizer(scene_map, protocol.localizer, seed=protocol.seed)
+    look = _Looker(scene_map, protocol)
+    parts = []
+    for number, (visit, direction) in enumerate(zip(visits, forward, strict=True), start=1):
+        if progress is not None:
+            progress(f"replay {recording.name}", number, len(visits))
+        candidates = recorded_candidates(
+            recording, visit, priors[visit.id], rules=protocol.candidates, forward_in_map=direction
+        )
+        prior_error = _prior_error(recording, priors[visit.id], truths[visit.id])
+        plan = VisitPlan(recording.name, priors[visit.id], prior_error, candidates, look.utilities(candidates))
+        chosen = {v.id: v for v in visit.views if v.id in candidates.view_ids}
+        parts.append(
+            _score_visit(
+                plan,
+                chosen,
+                truths[visit.id],
+                protocol,
+                map_digest=scene_map.digest,
+                localizer=localizer,
+                cache=cache,
+            )
+        )
+    return _Session(
+        trials=tuple(t for p in parts for t in p.trials),
+        results=tuple(r for p in parts for r in p.results),
+        truths=tuple(t for v in visits for t in truths[v.id].values()),
+        plans=tuple(p for part in parts for p in part.plans),
+        thumbnails={k: v for p in parts for k, v in p.thumbnails.items()},
+        excluded=tuple(excluded),
+    )
+
+
+def _priors_and_truths(
+    recording: Recording, tags: TagMap, protocol: Protocol
+) -> tuple[dict[str, Prior], dict[str, dict[str, Truth]], list[Excluded]]:
+    priors: dict[str, Prior] = {}
+    truths: dict[str, dict[str, Truth]] = {}
+    excluded: list[Excluded] = []
+    for visit in recording.visits:
+        try:
+            prior = estimate_prior(recording, visit, tags, noise=protocol.odometry)
+            truths[visit.id] = estimate_truths(recording, visit, tags)
+            priors[visit.id] = prior
+        except (PriorError, TruthError, FrameError) as error:
+            excluded.append(Excluded(f"{recording.name}/{visit.id}", str(error)))
+            log.warning("%s: visit %s is excluded: %s", recording.path, visit.id, error)
+    return priors, truths, excluded
+
+
+def _prior_error(recording: Recording, prior: Prior, truths: Mapping[str, Truth]) -> tuple[float, float]:
+    """Return the error (m, rad) of the prior against the true body, carried to the prior's time by odometry."""
+    times = {v.id: v.frame.t_ns for visit in recording.visits if visit.id == prior.visit for v in visit.views}
+    nearest = min(truths, key=lambda view: (abs(times[view] - prior.t_ns), view))
+    truth = truths[nearest]
+    map_from_body = truth.map_from_cam * truth.body_from_cam.inv()
+    moved = recording.odometry.at(times[nearest]).inv() * recording.odometry.at(prior.t_ns)
+    return pose_error(prior.map_from_body, map_from_body * moved)
+
+
+class _Looker:
+    """Compute every policy's utilities of candidates; landmark statistics and rays are made once per map."""
+
+    def __init__(self, scene_map: SceneMap, protocol: Protocol) -> None:
+        self._map = scene_map
+        self._protocol = protocol
+        self._statistics = landmark_statistics(scene_map)
+        self._rays = None if scene_map.surface is None else RayCaster(scene_map.surface)
+
+    def utilities(self, candidates: Candidates) -> dict[tuple[str, bool | None], policies.Array]:
+        """Return utilities f64[v] per policy and occlusion (None where the policy counts no landmarks)."""
+        scenes = {use: self._scene(candidates, occlusion=use) for use in {False, *self._protocol.occlusion.use}}
+        result: dict[tuple[str, bool | None], policies.Array] = {}
+        for name in self._protocol.policies:
+            if name in policies.NOT_RANKED:
+                continue
+            policy = policies.available(name)
+            if policy.counts_landmarks:
+                for use in self._protocol.occlusion.use:
+                    result[name, use] = policies.utility(policy, scenes[use])
+            else:
+                result[name, None] = policies.utility(policy, scenes[False])
+        return result
+
+    def _scene(self, candidates: Candidates, *, occlusion: bool) -> policies.Scene:
+        voxel_m = self._map.surface.voxel_m if self._map.surface is not None else 0.0
+        return policies.look_at(
+            self._map,
+            self._statistics,
+            candidates,
+            rules=self._protocol.candidates,
+            rays=self._rays if occlusion else None,
+            tolerance_m=self._protocol.occlusion.tolerance_voxels * voxel_m,
+        )
+
+
+def _score_visit(
+    plan: VisitPlan,
+    views: Mapping[str, View],
+    truths: Mapping[str, Truth],
+    protocol: Protocol,
+    *,
+    map_digest: str,
+    localizer: Localizer,
+    cache: store.EstimateCache,
+) -> _Session:
+    results: dict[str, ViewResult] = {}
+    thumbnails: dict[str, bytes] = {}
+    settings = repr((map_digest, protocol.feature, protocol.localizer, protocol.seed))
+    for view in views.values():
+        image = view.frame.read()
+        estimate = _localize_once(image, view, localizer, cache=cache, settings=settings)
+        results[view.id] = ViewResult(plan.session, plan.prior.visit, view.id, view.kind, view.frame.t_ns, estimate)
+        thumbnails[f"{plan.session}/{plan.prior.visit}/{view.id}"] = _thumbnail(image)
+    trials = scores.make_trials(plan, results, truths, protocol=protocol)
+    return _Session(trials, tuple(results.values()), tuple(truths.values()), (plan,), thumbnails)
+
+
+def _localize_once(
+    image: Image, view: View, localizer: Localizer, *, cache: store.EstimateCache, settings: str
+) -> Estimate:
+    key = store.digest(np.ascontiguousarray(image).tobytes(), repr(image.shape), repr(view.frame.camera), settings)
+    estimate = cache.get(key)
+    if estimate is None:
+        estimate = localizer.localize(image, view.frame.camera)
+        cache.put(key, estimate)
+    return estimate
+
+
+def _thumbnail(image: Image) -> bytes:
+    height, width = image.shape[:2]
+    size = (THUMBNAIL_PX, max(round(height * THUMBNAIL_PX / width), 1))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if small.ndim == 3:
+        small = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return bytes(data)
+
+
+def _collect(
+    recordings: Sequence[Recording],
+    sessions: Sequence[_Session],
+    *,
+    scene_map: SceneMap,
+    tags: TagMap,
+    protocol: Protocol,
+) -> Run:
+    return Run(
+        protocol=protocol,
+        map_digest=scene_map.digest,
+        tags_digest=tags.digest,
+        recordings=tuple(r.path for r in recordings),
+        sessions=tuple(r.name for r in recordings),
+        seed=protocol.seed,
+        versions={name: _version(name) for name in LIBRARIES},
+        trials=tuple(t for s in sessions for t in s.trials),
+        results=tuple(r for s in sessions for r in s.results),
+        truths=tuple((r.name, t) for r, s in zip(recordings, sessions, strict=True) for t in s.truths),
+        plans=tuple(p for s in sessions for p in s.plans),
+        plan_view=_plan_view(scene_map, protocol),
+        thumbnails={k: v for s in sessions for k, v in s.thumbnails.items()},
+        excluded=tuple(e for s in sessions for e in s.excluded),
+    )
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def _plan_view(scene_map: SceneMap, protocol: Protocol) -> PlanView:
+    rng = np.random.default_rng(protocol.seed)
+    keep = np.sort(rng.permutation(len(scene_map.xyz))[:PLAN_LANDMARKS])
+    cameras = np.array([p.translation for p in scene_map.map_from_image], dtype=np.float32).reshape(-1, 3)
+    return PlanView(scene_map.xyz[keep].astype(np.float32), cameras)
