@@ -1,0 +1,424 @@
+"""The command line: every command is a plain typed function that a notebook can call too."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from fieldkit.errors import FieldkitError
+
+# Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
+
+Positional = tyro.conf.Positional
+Repeated = tyro.conf.UseAppendAction
+
+
+def inspect(recording: Positional[Path], *, layout: str | None = None, json: bool = False) -> None:
+    """Say what a recording holds and what it lacks.
+
+    Args:
+        recording: bag file, ROS 2 bag folder, or session folder
+        layout: names of topics and frames; found by itself when not given
+        json: print JSON
+    """
+    from fieldkit.bags import inspect_recording
+
+    found = inspect_recording(recording, layout=layout)
+    _print_json(found) if json else _print_mapping(found, title=str(recording))
+
+
+def map_build(
+    source: Positional[Path], *, out: Path, feature: str = "sift", voxel_m: float = 0.04, force: bool = False
+) -> None:
+    """Build a metric map: SfM landmarks from the images, frame and scale from SLAM poses, surface from depth.
+
+    Args:
+        source: mapping folder (rig.toml) or image folder (images/, camera.toml, poses.txt, depth/)
+        out: map folder to write
+        feature: local feature of landmarks
+        voxel_m: edge length of a voxel of the surface
+        force: replace an existing map
+    """
+    from fieldkit import maps
+
+    with _progress() as progress:
+        report = maps.build_map(source, out, feature=feature, voxel_m=voxel_m, force=force, progress=progress)
+    _print_mapping(maps.map_info(out), title=str(out))
+    del report
+
+
+def map_info(path: Positional[Path], *, json: bool = False) -> None:
+    """Say what a map holds and how well it was aligned.
+
+    Args:
+        path: map folder
+        json: print JSON
+    """
+    from fieldkit import maps
+
+    found = maps.map_info(path)
+    _print_json(found) if json else _print_mapping(found, title=str(path))
+
+
+def map_compact(path: Positional[Path], *, out: Path, force: bool = False) -> None:
+    """Write a small copy of a map: one descriptor per landmark, 8 bit, and a thinned surface.
+
+    Args:
+        path: map folder
+        out: map folder to write
+        force: replace an existing map
+    """
+    from fieldkit import maps
+
+    maps.compact_map(path, out, force=force)
+    _print_mapping(maps.map_info(out), title=str(out))
+
+
+def tags_calibrate(
+    photos: Positional[Path],
+    *,
+    map: Path,
+    out: Path,
+    size_m: Repeated[tuple[str, ...]],
+    camera: Path | None = None,
+    json: bool = False,
+    force: bool = False,
+) -> None:
+    """Find the poses of AprilTags in a map from photos of them.
+
+    Args:
+        photos: folder with photos, and photos.toml where cameras or visits differ
+        map: map folder
+        out: tags.toml to write
+        size_m: edge length of the black square in m, or ID:SIZE for one tag; may be repeated
+        camera: camera.toml of the photos, where photos.toml names none
+        json: print JSON
+        force: replace an existing file
+    """
+    from fieldkit import store
+    from fieldkit.calibrate import calibrate_tags, parse_sizes
+
+    store.refuse_existing(out, force=force)
+    with _progress() as progress:
+        tags = calibrate_tags(photos, map, camera=camera, sizes_m=parse_sizes(size_m), progress=progress)
+    store.write_tags(out, tags)
+    if json:
+        _print_json(
+            {
+                "version": 1,
+                "map_digest": tags.map_digest,
+                "tags": [
+                    {
+                        "id": t.id,
+                        "visit": t.visit,
+                        "position_m": t.map_from_tag.translation,
+                        "quaternion_xyzw": t.map_from_tag.rotation.as_quat(),
+                        "n_photos": t.n_photos,
+                        "rms_px": t.rms_px,
+                        "verdict": t.verdict,
+                    }
+                    for t in tags.tags
+                ],
+                "photos": [
+                    {"file": p.file, "tag_id": p.tag_id, "visit": p.visit, "used": p.used, "reason": p.reason}
+                    for p in tags.photos
+                ],
+            }
+        )
+        return
+    table = _table("tag", "visit", "photos", "rms px", "sigma mm", "sigma deg", "verdict")
+    for t in tags.tags:
+        position, rotation = _sigmas(t.covariance)
+        cells = [t.id, t.visit or "-", t.n_photos, f"{t.rms_px:.2f}", f"{1e3 * position:.2f}", f"{rotation:.3f}"]
+        table.add_row(*map_str([*cells, t.verdict]))
+    Console().print(table)
+    for photo in tags.photos:
+        if not photo.used:
+            logging.getLogger(__name__).warning("%s: not used: %s", photo.file, photo.reason)
+
+
+def localize(
+    images: Positional[Path], *, map: Path, camera: Path, out: Path, json: bool = False, force: bool = False
+) -> None:
+    """Localize images in a map; write the poses as TUM text.
+
+    Args:
+        images: image file or folder of images
+        map: map folder
+        camera: camera.toml
+        out: poses.txt to write; a failed image has no line
+        json: print JSON with status, inliers, covariance and seconds per image
+        force: replace an existing file
+    """
+    from fieldkit import store
+    from fieldkit.localize import localize_images
+
+    store.refuse_existing(out, force=force)
+    with _progress() as progress:
+        found = localize_images(images, map_path=map, camera=store.read_camera(camera), progress=progress)
+    store.write_tum(out, [(n.replace(" ", "_"), e.map_from_cam) for n, e in found if e.map_from_cam is not None])
+    failed = [f"{n} ({e.status})" for n, e in found if e.map_from_cam is None]
+    if failed:
+        logging.getLogger(__name__).warning("%d of %d images failed: %s", len(failed), len(found), ", ".join(failed))
+    if json:
+        _print_json([{"name": n, **_estimate_json(e)} for n, e in found])
+        return
+    table = _table("image", "status", "matches", "inliers", "seconds")
+    for name, e in found:
+        table.add_row(*map_str([name, e.status, e.n_matches, e.n_inliers, f"{sum(e.seconds.values()):.2f}"]))
+    Console().print(table)
+
+
+def replay(
+    recordings: Positional[tuple[Path, ...]],
+    *,
+    map: Path,
+    out: Path,
+    tags: Path | None = None,
+    protocol: str = "paper_real",
+    force: bool = False,
+) -> None:
+    """Replay recordings through every policy of a protocol; print the recall table.
+
+    Args:
+        recordings: bag files, ROS 2 bag folders, or session folders
+        map: map folder
+        out: run folder to write
+        tags: tags.toml; not needed where a reference topic gives start and truth
+        protocol: name of a protocol, or a .toml file
+        force: replace an existing run
+    """
+    from fieldkit import protocol as protocols
+    from fieldkit.replay import replay as replay_recordings
+
+    rules = protocols.load(protocol)
+    with _progress() as progress:
+        run = replay_recordings(
+            recordings, map_path=map, tags_path=tags, protocol=rules, out=out, force=force, progress=progress
+        )
+    _print_recall(run, preset=None)
+
+
+def score(run: Positional[Path], *, preset: str | None = None, json: bool = False) -> int:
+    """Print the recall table of a run; exit with 3 when a bound of the protocol is missed.
+
+    Args:
+        run: run folder
+        preset: thresholds of another benchmark in place of the protocol's
+        json: print JSON
+    """
+    from fieldkit import scores, store
+
+    loaded = store.read_run(run)
+    if json:
+        _print_json(scores.score_dict(loaded, thresholds=None if preset is None else scores.preset(preset)))
+    else:
+        _print_recall(loaded, preset=preset)
+    misses = scores.check_expect(loaded)
+    for miss in misses:
+        logging.getLogger(__name__).error("%s: %s", run, miss)
+    return 3 if misses else 0
+
+
+def report(runs: Positional[tuple[Path, ...]], *, out: Path, force: bool = False) -> None:
+    """Write one self-contained HTML page about one or more runs.
+
+    Args:
+        runs: run folders
+        out: report.html to write
+        force: replace an existing file
+    """
+    from fieldkit import store
+    from fieldkit.report import write_report
+
+    write_report([store.read_run(run) for run in runs], out, force=force)
+    logging.getLogger(__name__).info("wrote %s", out)
+
+
+def judge(
+    session: Positional[Path], *, map: Path, tags: Path | None = None, run: Path | None = None, json: bool = False
+) -> None:
+    """Compare a synthesized session's truth with what was estimated, after one rigid fit of the map.
+
+    Args:
+        session: folder that `sim-bridge synthesize` wrote
+        map: map folder
+        tags: tags.toml
+        run: run folder
+        json: print JSON
+    """
+    from fieldkit.judge import judge as judge_session
+
+    found = judge_session(session, map_path=map, tags_path=tags, run_path=run)
+    if json:
+        _print_json(found)
+        return
+    console = Console()
+    for title in ("gauge", "map", "estimates"):
+        if found[title]:
+            _print_mapping(found[title], title=title)
+    for title, keys in (("tags", ("id", "visit")), ("priors", ("visit",)), ("truths", ("visit", "view"))):
+        if not found[title]:
+            continue
+        table = _table(*keys, "position m", "rotation deg", "nees", title=title)
+        for entry in found[title]:
+            numbers = [f"{entry['position_m']:.4f}", f"{entry['rotation_deg']:.3f}", f"{entry['nees']:.1f}"]
+            table.add_row(*map_str([*(entry[k] or "-" for k in keys), *numbers]))
+        console.print(table)
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "inspect": inspect,
+    "localize": localize,
+    "replay": replay,
+    "score": score,
+    "report": report,
+    "judge": judge,
+}
+GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
+    "map": {"build": map_build, "info": map_info, "compact": map_compact},
+    "tags": {"calibrate": tags_calibrate},
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line: exit 0 done, 1 a user's mistake in one line, 2 usage, 3 a missed bound."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    logging.basicConfig(
+        level=logging.INFO,
+        format="%(message)s",
+        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)],
+    )
+    try:
+        sys.exit(_dispatch(words))
+    except FieldkitError as error:
+        print(f"fieldkit: {error}", file=sys.stderr)
+        sys.exit(1)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("fieldkit: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+def _dispatch(words: Sequence[str]) -> int:
+    config = (tyro.conf.FlagCreatePairsOff,)
+    if words and words[0] in GROUPS:
+        group = GROUPS[words[0]]
+        result = tyro.extras.subcommand_cli_from_dict(group, prog=f"fieldkit {words[0]}", args=words[1:], config=config)
+    else:
+        described = "Which way should the robot look to know where it is, and how sure are we?\n\n" + "\n".join(
+            f"fieldkit {group} {' | '.join(commands)}" for group, commands in GROUPS.items()
+        )
+        result = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, prog="fieldkit", description=described, args=list(words), config=config
+        )
+    return int(result or 0)
+
+
+class _Bars:
+    """Progress bars on stderr, one per step; a step is called as (what, done, total)."""
+
+    def __init__(self) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._progress = Progress(*columns, console=Console(stderr=True))
+        self._steps: dict[str, Any] = {}
+
+    def __enter__(self) -> Callable[[str, int, int], None]:
+        self._progress.start()
+        return self._update
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def _update(self, what: str, done: int, total: int) -> None:
+        if what not in self._steps:
+            self._steps[what] = self._progress.add_task(what, total=total)
+        self._progress.update(self._steps[what], completed=done, total=total)
+
+
+def _progress() -> _Bars:
+    return _Bars()
+
+
+def _print_recall(run: Any, *, preset: str | None) -> None:
+    from fieldkit import scores
+
+    content = scores.table(run, thresholds=None if preset is None else scores.preset(preset))
+    table = Table(*content.header, caption=content.caption)
+    for row in content.rows:
+        table.add_row(*row)
+    Console(width=max(120, Console().width)).print(table)
+    for item in run.excluded:
+        logging.getLogger(__name__).warning("excluded %s: %s", item.what, item.reason)
+
+
+def _estimate_json(estimate: Any) -> dict[str, Any]:
+    found = estimate.map_from_cam
+    return {
+        "status": estimate.status,
+        "position_m": None if found is None else found.translation,
+        "quaternion_xyzw": None if found is None else found.rotation.as_quat(),
+        "matches": estimate.n_matches,
+        "inliers": estimate.n_inliers,
+        "confidence": estimate.confidence,
+        "covariance": None if estimate.covariance is None else estimate.covariance.ravel(),
+        "seconds": dict(estimate.seconds),
+    }
+
+
+def _sigmas(covariance: Any) -> tuple[float, float]:
+    """Return the standard deviations of position (m) and rotation (deg) of a 6x6 covariance."""
+    import numpy as np
+
+    return float(np.sqrt(np.trace(covariance[3:, 3:]))), float(np.degrees(np.sqrt(np.trace(covariance[:3, :3]))))
+
+
+def map_str(values: Sequence[object]) -> list[str]:
+    """Return the cells of a table row as text."""
+    return [str(v) for v in values]
+
+
+def _table(*header: str, title: str | None = None) -> Table:
+    return Table(*header, title=title, title_justify="left")
+
+
+def _print_json(values: Any) -> None:
+    from fieldkit.store import plain_json
+
+    print(plain_json(values), end="")
+
+
+def _print_mapping(values: dict[str, Any], *, title: str) -> None:
+    table = Table("", "", show_header=False, title=title, title_justify="left")
+    for key, value in _flat(values):
+        table.add_row(key, f"{value:.5g}" if isinstance(value, float) else str(value))
+    Console().print(table)
+
+
+def _flat(values: dict[str, Any], *, prefix: str = "") -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        if isinstance(value, dict):
+            rows += _flat(value, prefix=f"{prefix}{key}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for index, item in enumerate(value):
+                rows += _flat(item, prefix=f"{prefix}{key}[{index}].")
+        else:
+            rows.append((prefix + key, value))
+    return rows
+
+
+if __name__ == "__main__":
+    main()
