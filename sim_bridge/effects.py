@@ -1,0 +1,43 @@
+"""What a sensor adds to a rendered image: noise, and the file formats."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+
+def add_noise(image: Image, *, sigma: float, rng: np.random.Generator) -> Image:
+    """Return the image with noise of a standard deviation (grey levels), the same in all channels of a pixel."""
+    if sigma <= 0.0:
+        return image
+    noise = rng.standard_normal(image.shape[:2], dtype=np.float32) * np.float32(sigma)
+    shifted = image.astype(np.float32) + (noise if image.ndim == 2 else noise[:, :, None])
+    return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)
+
+
+def grey(rgb: Image) -> Image:
+    """Return the luminance of an RGB image."""
+    result: Image = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return result
+
+
+def jpeg(image: Image, *, quality: int) -> bytes:
+    """Encode a grey or RGB image as JPEG; colour is kept at full resolution so that edges do not smear."""
+    data = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    settings = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        quality,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
+    return bytes(cv2.imencode(".jpg", data, settings)[1])
+
+
+def depth_png(depth_m: NDArray[np.float32], *, far_m: float) -> bytes:
+    """Encode depth as 16-bit PNG in mm; 0 where there is none or it lies beyond ``far_m``."""
+    valid = (depth_m > 0) & (depth_m <= far_m)
+    millimetres = np.where(valid, np.rint(depth_m * 1000.0), 0).astype(np.uint16)
+    return bytes(cv2.imencode(".png", millimetres)[1])
