@@ -1,0 +1,123 @@
+"""Nearest neighbours among descriptors, exact: 8-bit dot products fit float32, so every machine gives the same bits."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.features import Descriptors
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+
+def match_pair(first: Descriptors, second: Descriptors, *, ratio: float) -> NDArray[np.uint32]:
+    """Match descriptors (n, w) and (m, w): mutual nearest neighbours that pass the distance ratio in both images.
+
+    Returns uint32[k, 2] of indices, sorted by the first. A ratio of 1 switches that test off.
+    """
+    if len(first) < 2 or len(second) < 2:
+        return np.zeros((0, 2), dtype=np.uint32)
+    distance = _squared_distances(first, second)
+    forward, forward_ok, backward, backward_ok = _mutual(distance, np.float32(ratio * ratio))
+    rows = np.arange(len(first))
+    kept = (backward[forward] == rows) & forward_ok & backward_ok[forward]
+    return np.column_stack([rows[kept], forward[kept]]).astype(np.uint32)
+
+
+def match_groups(
+    query: Descriptors, stored: Descriptors, group: Ints, *, ratio: float
+) -> tuple[Ints, Ints, NDArray[np.float32]]:
+    """Match query descriptors (n, w) to groups (landmarks) that own several stored descriptors (m, w).
+
+    The ratio test compares the best descriptor with the best one of ANOTHER group, so that a landmark seen in
+    many images does not compete with itself. Every group keeps only its nearest query. Returns query indices
+    (sorted), groups, and squared distances.
+    """
+    empty = np.zeros(0, dtype=np.int32)
+    if not len(query) or not len(stored):
+        return empty, empty, np.zeros(0, dtype=np.float32)
+    best, best_distance, other_distance = _nearest_groups(_squared_distances(query, stored), group)
+    kept = np.flatnonzero(best_distance < np.float32(ratio * ratio) * other_distance)
+    order = kept[np.lexsort((kept, best_distance[kept], group[best[kept]]))]
+    groups = group[best[order]]
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = groups[1:] != groups[:-1]
+    chosen = np.sort(order[first])
+    return chosen.astype(np.int32), group[best[chosen]], best_distance[chosen]
+
+
+def _squared_distances(first: Descriptors, second: Descriptors) -> Floats:
+    a, b = np.asarray(first, dtype=np.float32), np.asarray(second, dtype=np.float32)
+    product = a @ b.T
+    product *= -2.0
+    product += np.einsum("ij,ij->i", a, a)[:, None]
+    product += np.einsum("ij,ij->i", b, b)[None, :]
+    return np.asarray(product, dtype=np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _mutual(distance, squared_ratio):  # type: ignore[no-untyped-def]
+    """Return for rows and columns the nearest index and whether it passes the ratio test, in one pass."""
+    n, m = distance.shape
+    row_best = np.zeros(n, dtype=np.int32)
+    row_ok = np.zeros(n, dtype=np.bool_)
+    column_best = np.zeros(m, dtype=np.int32)
+    column_first = np.full(m, np.inf, dtype=np.float32)
+    column_second = np.full(m, np.inf, dtype=np.float32)
+    for i in range(n):
+        first = np.float32(np.inf)
+        second = np.float32(np.inf)
+        best = 0
+        for j in range(m):
+            d = distance[i, j]
+            if d < second:
+                if d < first:
+                    second = first
+                    first = d
+                    best = j
+                else:
+                    second = d
+            if d < column_second[j]:
+                if d < column_first[j]:
+                    column_second[j] = column_first[j]
+                    column_first[j] = d
+                    column_best[j] = i
+                else:
+                    column_second[j] = d
+        row_best[i] = best
+        row_ok[i] = first < squared_ratio * second
+    return row_best, row_ok, column_best, column_first < squared_ratio * column_second
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_groups(distance, group):  # type: ignore[no-untyped-def]
+    """Return per row the nearest column, its distance, and the nearest distance among columns of other groups."""
+    n, m = distance.shape
+    best = np.zeros(n, dtype=np.int32)
+    nearest = np.full(n, np.inf, dtype=np.float32)
+    other = np.full(n, np.inf, dtype=np.float32)
+    for i in range(n):
+        first = np.float32(np.inf)
+        second = np.float32(np.inf)
+        index = 0
+        owner = -1
+        for j in range(m):
+            d = distance[i, j]
+            if d < second:
+                if group[j] == owner:
+                    if d < first:
+                        first = d
+                        index = j
+                elif d < first:
+                    second = first
+                    first = d
+                    index = j
+                    owner = group[j]
+                else:
+                    second = d
+        best[i] = index
+        nearest[i] = first
+        other[i] = second
+    return best, nearest, other

@@ -1,0 +1,187 @@
+"""Map folders on disk: a COLMAP model, features as hloc writes them, a surface, and map.toml."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import h5py
+import msgspec
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from fieldkit.errors import MapError
+from fieldkit.features import FEATURES, Features
+from fieldkit.errors import suggestion
+from fieldkit.maps.landmarks import landmark_covariance, model_arrays
+from fieldkit.maps.sfm import quiet_colmap
+from fieldkit.store import digest, read_toml, write_toml
+from fieldkit.surface import read_ply
+from fieldkit.types import SceneMap, Surface
+
+_MODEL_FILES = ("cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin")
+
+
+class AlignmentEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """[alignment] of map.toml; residuals in m, gravity in deg."""
+
+    source: Literal["slam", "tags", "depth", "known"]
+    scale: float
+    n_used: int
+    n_total: int
+    rms_m: float
+    p95_m: float
+    gravity_deg: float
+    verdict: Literal["pass", "warn", "fail"]
+
+
+class SurfaceEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """[surface] of map.toml."""
+
+    voxel_m: float
+    truncation_m: float
+    file: str
+
+
+class MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """map.toml."""
+
+    version: Literal[1]
+    digest: str
+    feature: str
+    n_images: int
+    n_registered: int
+    n_landmarks: int
+    alignment: AlignmentEntry
+    surface: SurfaceEntry | None = None
+
+
+def write_features(path: Path, features: Mapping[str, Features], sizes: Mapping[str, tuple[int, int]], *, compress: bool = False) -> None:
+    """Write features.h5 in hloc's layout: per image name keypoints (n, 2) without COLMAP's half pixel,
+    descriptors (w, n), scores (n,) and image_size (2,) = width, height."""
+    options: dict[str, Any] = {"compression": "gzip", "compression_opts": 9, "shuffle": True} if compress else {}
+    with h5py.File(path, "w", track_order=False) as file:
+        for name in sorted(features):
+            found = features[name]
+            group = file.create_group(name)
+            filled = options if len(found) else {}
+            group.create_dataset("keypoints", data=found.keypoints_px - np.float32(0.5), **filled)
+            group.create_dataset("descriptors", data=np.ascontiguousarray(found.descriptors.T), **filled)
+            group.create_dataset("scores", data=found.scores, **filled)
+            group.create_dataset("image_size", data=np.array(sizes[name], dtype=np.int32))
+
+
+def read_features(path: Path, names: tuple[str, ...]) -> dict[str, tuple[NDArray[np.float32], NDArray[Any]]]:
+    """Read keypoints (n, 2) in COLMAP pixels and descriptors (n, w) per image name from an hloc features.h5.
+
+    Raises MapError when the file or an image's entry is missing or damaged.
+    """
+    result = {}
+    try:
+        with h5py.File(path, "r") as file:
+            for name in names:
+                if name not in file:
+                    raise MapError(f"{path}: no features of {name}", hint="the file belongs to another map; build the map again")
+                keypoints = np.asarray(file[name]["keypoints"], dtype=np.float32) + np.float32(0.5)
+                descriptors = np.asarray(file[name]["descriptors"])
+                if descriptors.ndim != 2 or descriptors.shape[1] != len(keypoints):
+                    raise MapError(
+                        f"{path}: {name} has {len(keypoints)} keypoints and descriptors {descriptors.shape}; expected (w, n)",
+                        hint="build the map again",
+                    )
+                result[name] = keypoints, np.ascontiguousarray(descriptors.T)
+    except (OSError, KeyError) as error:
+        raise MapError(f"{path}: cannot be read: {error}; expected features as hloc writes them", hint="build the map again") from error
+    return result
+
+
+def content_digest(folder: Path) -> str:
+    """Return the digest over model, features and surface of a map folder."""
+    files = [*(folder / "sparse" / name for name in _MODEL_FILES), folder / "features.h5", folder / "surface.ply"]
+    parts: list[bytes | str | Path] = []
+    for file in files:
+        if file.is_file():
+            parts += [file.name, file]
+    return digest(*parts)
+
+
+def read_map_file(path: Path) -> MapFile:
+    """Read map.toml of a map folder; raises MapError when the folder is not a map."""
+    path = Path(path)
+    if not path.is_dir():
+        raise MapError(f"{path}: no such folder; expected a map folder", hint="build one with `fieldkit map build`")
+    if not (path / "map.toml").is_file():
+        raise MapError(f"{path}: no map.toml in it; expected a map folder", hint="build one with `fieldkit map build`")
+    return read_toml(path / "map.toml", MapFile, what="map.toml of fieldkit")
+
+
+def load_map(path: Path) -> SceneMap:
+    """Load a map folder: landmarks with covariance, who saw them, their descriptors, and the surface if it has one.
+
+    Raises MapError when a file is missing or damaged, or the map's feature is unknown here.
+    """
+    path = Path(path)
+    entry = read_map_file(path)
+    if entry.feature not in FEATURES:
+        raise MapError(f"{path}: built with feature {entry.feature!r}", hint=suggestion(entry.feature, list(FEATURES)))
+    model = model_arrays(read_model(path / "sparse"))
+    stored = read_features(path / "features.h5", model.image_names)
+    rows = [stored[name][1][model.observation_keypoint[model.observation_image == i]] for i, name in enumerate(model.image_names)]
+    width = FEATURES[entry.feature].width
+    descriptors = np.concatenate(rows) if rows else np.zeros((0, width), dtype=np.uint8)
+    if descriptors.shape[1] != width:
+        raise MapError(
+            f"{path / 'features.h5'}: descriptors are {descriptors.shape[1]} wide; expected {width} of {entry.feature!r}",
+            hint="the file belongs to another feature",
+        )
+    # A compact map keeps one descriptor per landmark; the others are zero.
+    filled = descriptors.any(axis=1)
+    return SceneMap(
+        path=str(path),
+        digest=entry.digest,
+        feature=entry.feature,
+        xyz=model.xyz,
+        xyz_covariance=landmark_covariance(
+            model.xyz, model.observation_landmark, model.observation_image, model.map_from_image, model.image_cameras
+        ),
+        image_names=model.image_names,
+        image_cameras=model.image_cameras,
+        map_from_image=model.map_from_image,
+        observation_landmark=model.observation_landmark,
+        observation_image=model.observation_image,
+        observation_px=model.observation_px,
+        descriptors=descriptors[filled],
+        descriptor_landmark=model.observation_landmark[filled],
+        descriptor_image=model.observation_image[filled],
+        surface=_read_surface(path, entry.surface),
+    )
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model (binary or text); raises MapError when it is missing or damaged."""
+    try:
+        with quiet_colmap():
+            return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError) as error:
+        raise MapError(f"{folder}: no readable COLMAP model; expected {', '.join(_MODEL_FILES)}", hint="build the map again") from error
+
+
+def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
+    if entry is None:
+        return None
+    if not (path / entry.file).is_file():
+        raise MapError(f"{path / entry.file}: no such file; map.toml names it as the surface", hint="build the map again")
+    return dataclasses.replace(read_ply(path / entry.file), voxel_m=entry.voxel_m)
+
+
+def map_info(path: Path) -> dict[str, Any]:
+    """Return what map.toml says of a map, as plain values, with its path."""
+    return {"path": str(path), **msgspec.to_builtins(read_map_file(path))}
+
+
+def write_map_file(path: Path, entry: MapFile) -> None:
+    """Write map.toml."""
+    write_toml(path / "map.toml", entry)

@@ -1,0 +1,148 @@
+"""Structure from motion by COLMAP with known intrinsics, seeded and single threaded so that it repeats bit for bit."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from fieldkit.cameras import Camera
+from fieldkit.errors import MapError
+from fieldkit.features import Features
+from fieldkit.maps.pairs import Pair
+from fieldkit.maps.source import SourceImage
+
+# Below this number of verified matches a pair is not used (COLMAP's own bound).
+_MIN_MATCHES = 15
+
+
+@contextlib.contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Silence COLMAP's log below errors while it works, and put the old level back."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value + 1
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def colmap_camera(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
+    """Return COLMAP's camera with the same model, size and parameters."""
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+        has_prior_focal_length=True,
+    )
+
+
+def write_database(
+    path: Path,
+    images: Sequence[SourceImage],
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+    matches: Sequence[NDArray[np.uint32]],
+) -> None:
+    """Write cameras, images (id = index + 1), keypoints and matches into a new COLMAP database."""
+    with contextlib.closing(pycolmap.Database.open(path)) as database, pycolmap.DatabaseTransaction(database):
+        camera_ids: dict[tuple[str, Camera], int] = {}
+        for i, (image, found) in enumerate(zip(images, features, strict=True), start=1):
+            key = (image.sequence, image.camera)
+            if key not in camera_ids:
+                camera_ids[key] = len(camera_ids) + 1
+                camera = colmap_camera(image.camera, camera_ids[key])
+                database.write_camera(camera, use_camera_id=True)
+                rig = pycolmap.Rig(rig_id=camera_ids[key])
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+            row = pycolmap.Image(name=image.name, camera_id=camera_ids[key], image_id=i)
+            database.write_image(row, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=i, rig_id=camera_ids[key])
+            frame.add_data_id(row.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(i, found.keypoints_px.astype(np.float32))
+        for (a, b), found_matches in zip(pairs, matches, strict=True):
+            if len(found_matches) >= _MIN_MATCHES:
+                database.write_matches(a + 1, b + 1, found_matches)
+
+
+def verify_geometry(path: Path, *, seed: int) -> int:
+    """Verify all matches of a database by two-view geometry; return the number of pairs that hold."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = _MIN_MATCHES
+    options.detect_watermark = False
+    options.ransac.random_seed = seed
+    options.ransac.num_threads = 1
+    pycolmap.geometric_verification(path, two_view_geometry_options=options)
+    with contextlib.closing(pycolmap.Database.open(path)) as database:
+        return int(database.num_verified_image_pairs())
+
+
+def reconstruct(
+    images: Sequence[SourceImage],
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+    matches: Sequence[NDArray[np.uint32]],
+    *,
+    seed: int,
+    progress: Callable[[str, int, int], None],
+) -> pycolmap.Reconstruction:
+    """Reconstruct cameras and points; return the model with the most images, in SfM's own scale and frame.
+
+    Intrinsics stay fixed. Raises MapError when no pair of images can be verified or no model grows.
+    """
+    with tempfile.TemporaryDirectory(prefix="fieldkit-sfm-") as folder, quiet_colmap():
+        database = Path(folder) / "database.db"
+        write_database(database, images, features, pairs, matches)
+        progress("verify", 0, len(pairs))
+        n_verified = verify_geometry(database, seed=seed)
+        progress("verify", len(pairs), len(pairs))
+        if not n_verified:
+            raise MapError(
+                f"no pair of the {len(images)} images shows the same place ({len(pairs)} pairs tried)",
+                hint="take overlapping, textured, sharp images and check the camera's parameters",
+            )
+        done = 0
+
+        def count() -> None:
+            nonlocal done
+            done += 1
+            progress("reconstruct", min(done + 2, len(images)), len(images))
+
+        models = pycolmap.incremental_mapping(
+            database, folder, Path(folder) / "models", options=_mapping_options(seed), next_image_callback=count
+        )
+    if not models:
+        raise MapError(
+            f"no reconstruction grew from {n_verified} verified pairs of {len(images)} images",
+            hint="move sideways while mapping (turning on the spot gives no depth) and check the camera's parameters",
+        )
+    return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
+
+
+def _mapping_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.num_threads = 1
+    options.extract_colors = False
+    options.ba_refine_focal_length = False
+    options.ba_refine_principal_point = False
+    options.ba_refine_extra_params = False
+    options.min_model_size = 3
+    options.mapper.abs_pose_refine_focal_length = False
+    options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def threads() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

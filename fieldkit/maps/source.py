@@ -1,0 +1,141 @@
+"""What a map is built from: a rig folder or an image folder, checked before any work starts."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from fieldkit.cameras import Camera
+from fieldkit.errors import MapError
+from fieldkit.frames import Pose
+from fieldkit.store import read_camera, read_rig, read_tum
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".bmp")
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceImage:
+    """One mapping image: name below images/, file, camera, sequence (one camera's walk), frame, and SLAM pose."""
+
+    name: str
+    file: Path
+    camera: Camera
+    sequence: str
+    frame: str
+    slam_from_cam: Pose | None
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthFrame:
+    """A depth image and the mapping images from whose poses its own follows: (index, cam_from_depth) each."""
+
+    file: Path
+    anchors: tuple[tuple[int, Pose], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class MapSource:
+    """All mapping images (sorted by sequence and frame), and the depth images if there are any."""
+
+    path: Path
+    images: tuple[SourceImage, ...]
+    depth_camera: Camera | None
+    depth: tuple[DepthFrame, ...]
+
+
+def read_source(path: Path) -> MapSource:
+    """Read a SOURCE folder: with rig.toml a rig's walk, else images/ and camera.toml.
+
+    Raises MapError when it is neither, or when images, camera or poses are missing.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise MapError(
+            f"{path}: no such folder; expected a folder with images/ and camera.toml or rig.toml",
+            hint="check the path",
+        )
+    if not (path / "images").is_dir():
+        raise MapError(f"{path}: no folder images/", hint="put the mapping images into images/")
+    source = _read_rig_folder(path) if (path / "rig.toml").is_file() else _read_image_folder(path)
+    if not source.images:
+        raise MapError(
+            f"{path / 'images'}: no image found; expected files like {', '.join(IMAGE_SUFFIXES[:3])}",
+            hint="put the mapping images there",
+        )
+    return source
+
+
+def _image_files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+
+
+def _read_rig_folder(path: Path) -> MapSource:
+    rig = read_rig(path / "rig.toml")
+    poses = _poses(path / "slam_poses.txt")
+    images: list[SourceImage] = []
+    frames: dict[str, list[tuple[int, Pose]]] = {}
+    for camera in rig.cameras:
+        folder = path / "images" / camera.name
+        if not folder.is_dir():
+            raise MapError(f"{folder}: no such folder; rig.toml has a camera {camera.name!r}", hint="add its images")
+        for file in _image_files(folder):
+            slam_from_rig = poses.get(file.stem)
+            slam_from_cam = None if slam_from_rig is None else slam_from_rig * camera.rig_from_cam
+            if rig.depth is not None:
+                cam_from_depth = camera.rig_from_cam.inv() * rig.depth.rig_from_cam
+                frames.setdefault(file.stem, []).append((len(images), cam_from_depth))
+            name = f"{camera.name}/{file.name}"
+            images.append(SourceImage(name, file, camera.camera, camera.name, file.stem, slam_from_cam))
+    depth = tuple(
+        DepthFrame(path / "depth" / f"{frame}.png", tuple(anchors))
+        for frame, anchors in sorted(frames.items())
+        if (path / "depth" / f"{frame}.png").is_file()
+    )
+    return MapSource(path, tuple(images), rig.depth.camera if rig.depth and depth else None, depth)
+
+
+def _read_image_folder(path: Path) -> MapSource:
+    camera = read_camera(path / "camera.toml")
+    poses = _poses(path / "poses.txt")
+    images = []
+    for file in _image_files(path / "images"):
+        pose = poses.get(file.name, poses.get(file.stem))
+        images.append(SourceImage(file.name, file, camera, "", file.stem, pose))
+    _refuse_duplicates(path, images)
+    depth = tuple(
+        DepthFrame(path / "depth" / f"{image.frame}.png", ((i, Pose.identity()),))
+        for i, image in enumerate(images)
+        if (path / "depth" / f"{image.frame}.png").is_file()
+    )
+    if depth and not (path / "depth_camera.toml").is_file():
+        raise MapError(
+            f"{path}: depth/ without depth_camera.toml",
+            hint="add depth_camera.toml (camera.toml of the depth camera), or take depth/ away",
+        )
+    return MapSource(path, tuple(images), read_camera(path / "depth_camera.toml") if depth else None, depth)
+
+
+def _refuse_duplicates(path: Path, images: list[SourceImage]) -> None:
+    seen: dict[str, str] = {}
+    for image in images:
+        if image.frame in seen:
+            raise MapError(
+                f"{path / 'images'}: {seen[image.frame]} and {image.name} have the same name; expected one file per name",
+                hint="rename one of them",
+            )
+        seen[image.frame] = image.name
+
+
+def _poses(path: Path) -> dict[str, Pose]:
+    if not path.is_file():
+        raise MapError(
+            f"{path}: no such file; expected SLAM poses, which give the map its scale and gravity",
+            hint="write one TUM line per image: name tx ty tz qx qy qz qw",
+        )
+    rows = read_tum(path)
+    poses = dict(rows)
+    if len(poses) < len(rows):
+        names = [name for name, _ in rows]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise MapError(f"{path}: {twice} has two poses; expected one per name", hint="take one of them out")
+    return poses
