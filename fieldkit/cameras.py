@@ -113,7 +113,7 @@ class Camera:
         with np.errstate(invalid="ignore"):
             inside = front & (pixels >= 0).all(axis=1) & (pixels < (self.width, self.height)).all(axis=1)
             if not self.is_fisheye and not self.is_pinhole:
-                inside &= np.hypot(xy[:, 0], xy[:, 1]) <= 1.1 * self._radius()
+                inside &= np.hypot(xy[:, 0], xy[:, 1]) <= self._monotonic_radius()
         return pixels, inside
 
     def unproject(self, pixels: ArrayLike) -> Array:
@@ -144,9 +144,14 @@ class Camera:
                 break
         return xy
 
-    def _radius(self) -> float:
-        corners = [(0.0, 0.0), (self.width, 0.0), (0.0, self.height), (self.width, self.height)]
-        return float(np.linalg.norm(self.unproject(corners)[:, :2], axis=1).max())
+    def _monotonic_radius(self) -> float:
+        """Return the normalised radius beyond which the radial distortion folds points back towards the centre."""
+        k1, k2, _, _, k3, k4, k5, k6 = self.opencv_distortion
+        r = np.linspace(0.0, 10.0, 4001)
+        folded = np.flatnonzero(
+            np.diff(_distort(np.column_stack([r, 0 * r]), (k1, k2, 0, 0, k3, k4, k5, k6))[:, 0]) <= 0
+        )
+        return float(r[folded[0]]) if len(folded) else float("inf")
 
     def scaled(self, factor: float) -> Camera:
         """Return the camera of the image resized by a factor (size rounded, centre scaled: no half-pixel shift)."""

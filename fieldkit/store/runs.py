@@ -322,7 +322,8 @@ class EstimateCache:
 
     def put(self, key: str, estimate: Estimate) -> None:
         """Append an estimate."""
-        line = json.dumps({"key": key, **_estimate_plain(estimate)}) + "\n"
+        # The line break in front ends a line that a kill may have cut off.
+        line = "\n" + json.dumps({"key": key, **_estimate_plain(estimate)}) + "\n"
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a", encoding="utf-8") as stream:
             stream.write(line)
@@ -337,7 +338,8 @@ class EstimateCache:
             for line in self.path.read_text(encoding="utf-8").splitlines():
                 try:
                     entry = json.loads(line)
-                    known[entry.pop("key")] = _estimate_from_plain(entry)
+                    key = entry.pop("key")
+                    known[key] = _estimate_from_plain(entry)
                 except (ValueError, KeyError, TypeError, FieldkitError):
                     continue
         return known
