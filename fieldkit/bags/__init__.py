@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from fieldkit.bags.inspecting import inspect_recording
 from fieldkit.bags.layouts import LAYOUTS, Layout
+from fieldkit.bags.reading import open_recording
+from fieldkit.bags.tf import TfBuffer
 from fieldkit.bags.writing import BagFormat, RecordingWriter
 
-__all__ = ["LAYOUTS", "BagFormat", "Layout", "RecordingWriter"]
+__all__ = ["LAYOUTS", "BagFormat", "Layout", "RecordingWriter", "TfBuffer", "inspect_recording", "open_recording"]

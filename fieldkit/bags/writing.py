@@ -16,9 +16,9 @@ from mcap.writer import Writer as McapFile
 from numpy.typing import ArrayLike
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from fieldkit.bags.files import ros1_types, ros2_types
 from fieldkit.bags.layouts import Layout, find_layout, fit_layout
 from fieldkit.cameras import Camera, camera_info_fields
 from fieldkit.errors import BagError, suggestion
@@ -50,13 +50,6 @@ _LATCHED_YAML = """- history: keep_last
   liveliness_lease_duration: {sec: 0, nsec: 0}
   avoid_ros_namespace_conventions: false
 """
-
-
-def ros1_types() -> Typestore:
-    """Return the standard messages of ROS 1, with tf2_msgs, which the library's own collection lacks."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    return store
 
 
 class _Container(Protocol):
@@ -96,7 +89,7 @@ class _Ros1Bag:
 
 class _Ros2Bag:
     def __init__(self, path: Path, latched: frozenset[str]) -> None:
-        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self.store = ros2_types()
         self._latched = latched
         self._topics: dict[str, Connection] = {}
         # Version 8 is what ROS 2 Iron writes; it and every later release read it
@@ -120,7 +113,7 @@ class _Ros2Bag:
 
 class _McapBag:
     def __init__(self, path: Path, latched: frozenset[str]) -> None:
-        self.store = get_typestore(Stores.ROS2_JAZZY)
+        self.store = ros2_types()
         self._latched = latched
         self._topics: dict[str, int] = {}
         self._schemas: dict[str, int] = {}

@@ -1,0 +1,162 @@
+"""One pass over a bag: everything small is kept, of images only where they are."""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from fieldkit.bags.files import BagFile, Place
+from fieldkit.bags.layouts import Layout
+from fieldkit.bags.tf import TfBuffer, clean_frame
+from fieldkit.cameras import Camera, camera_from_info
+from fieldkit.errors import BagError, FieldkitError
+from fieldkit.frames import Pose, Trajectory, pose
+
+# Message types that may stand on the topics of a layout
+_IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+
+@dataclasses.dataclass(frozen=True)
+class ImagePlace:
+    """An image that was seen in passing: header stamp, frame, size where the message tells it, and its place."""
+
+    t_ns: int
+    frame: str
+    size: tuple[int, int] | None
+    place: Place
+
+
+@dataclasses.dataclass
+class PoseSamples:
+    """Stamped poses in the order of arrival, with the frames that their messages name."""
+
+    samples: list[tuple[int, Pose]] = dataclasses.field(default_factory=list)
+    parent: str = ""
+    child: str = ""
+
+    def trajectory(self, *, parent: str, child: str) -> tuple[Trajectory, int]:
+        """Return the trajectory, and how many samples it left out because their stamp repeats an earlier one."""
+        ordered = sorted(self.samples, key=lambda item: item[0])
+        kept = [s for i, s in enumerate(ordered) if i == 0 or s[0] != ordered[i - 1][0]]
+        stamps = np.array([t for t, _ in kept], dtype=np.int64)
+        poses = tuple(p for _, p in kept)
+        return Trajectory(stamps, poses, self.parent or parent, self.child or child), len(ordered) - len(kept)
+
+
+@dataclasses.dataclass
+class Content:
+    """What one pass over a bag found on the topics of a layout."""
+
+    image_topic: str
+    images: list[ImagePlace] = dataclasses.field(default_factory=list)
+    cameras: list[tuple[int, Camera]] = dataclasses.field(default_factory=list)
+    odometry: PoseSamples = dataclasses.field(default_factory=PoseSamples)
+    reference: PoseSamples = dataclasses.field(default_factory=PoseSamples)
+    tf: TfBuffer = dataclasses.field(default_factory=TfBuffer)
+    events: list[tuple[int, str]] = dataclasses.field(default_factory=list)
+    joints: list[tuple[int, dict[str, float]]] = dataclasses.field(default_factory=list)
+    refused: Counter[str] = dataclasses.field(default_factory=Counter)
+    last_ns: int = 0
+
+    def camera_at(self, t_ns: int) -> Camera:
+        """Return the calibration whose stamp is nearest; the later one when two are equally near."""
+        right = bisect.bisect_left(self.cameras, t_ns, key=lambda item: item[0])
+        near = self.cameras[max(right - 1, 0) : right + 1]
+        return min(reversed(near), key=lambda item: abs(item[0] - t_ns))[1]
+
+
+def stamp_ns(header: Any) -> int:
+    """Return a message header's stamp in ns."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def image_topic(bag: BagFile, layout: Layout) -> str:
+    """Return the topic with most images; the uncompressed one when both have as many."""
+    counts = {t: bag.topics[t].count if t in bag.topics else 0 for t in (layout.image, layout.compressed)}
+    return max(counts, key=lambda t: counts[t])
+
+
+def collect(bag: BagFile, layout: Layout) -> Content:
+    """Read everything on a layout's topics once. Raises BagError for a damaged bag or an impossible CameraInfo."""
+    content = Content(image_topic(bag, layout))
+    cache: dict[tuple[Any, ...], Camera] = {}
+    topics = {content.image_topic, layout.camera_info, layout.odometry, layout.tf, layout.tf_static}
+    topics |= {layout.events, layout.reference, layout.joint_states}
+    for message in bag.messages(topics):
+        value, kind = message.value, message.value.__msgtype__
+        content.last_ns = max(content.last_ns, message.place.log_ns)
+        if message.topic == content.image_topic and kind in (
+            "sensor_msgs/msg/Image",
+            "sensor_msgs/msg/CompressedImage",
+        ):
+            size = (int(value.width), int(value.height)) if hasattr(value, "width") else None
+            content.images.append(
+                ImagePlace(stamp_ns(value.header), clean_frame(value.header.frame_id), size, message.place)
+            )
+        elif message.topic == layout.camera_info and kind == "sensor_msgs/msg/CameraInfo":
+            content.cameras.append((stamp_ns(value.header), _camera(bag, layout.camera_info, value, cache)))
+        elif message.topic == layout.odometry and kind == "nav_msgs/msg/Odometry":
+            _add_pose(content, content.odometry, value, value.pose.pose, child=value.child_frame_id)
+        elif message.topic == layout.reference and kind == "geometry_msgs/msg/PoseStamped":
+            _add_pose(content, content.reference, value, value.pose, child="")
+        elif message.topic in (layout.tf, layout.tf_static) and kind in _TF_TYPES:
+            _add_transforms(content, value.transforms, static=message.topic == layout.tf_static)
+        elif message.topic == layout.events and kind == "std_msgs/msg/String":
+            content.events.append((message.place.log_ns, value.data))
+        elif message.topic == layout.joint_states and kind == "sensor_msgs/msg/JointState":
+            angles = dict(zip(value.name, (float(v) for v in value.position), strict=False))
+            content.joints.append((stamp_ns(value.header), angles))
+        else:
+            content.refused[f"messages of type {kind} on {message.topic}"] += 1
+    content.images.sort(key=lambda image: image.t_ns)
+    content.cameras.sort(key=lambda item: item[0])
+    return content
+
+
+def _camera(bag: BagFile, topic: str, info: Any, cache: dict[tuple[Any, ...], Camera]) -> Camera:
+    # ROS 1 spells the matrices in capitals
+    k, d = (getattr(info, name, None) for name in ("k", "d"))
+    k, d = (info.K if k is None else k), (info.D if d is None else d)
+    key = (info.width, info.height, tuple(k), tuple(d), info.distortion_model)
+    if key not in cache:
+        try:
+            cache[key] = camera_from_info(
+                int(info.width), int(info.height), k, list(d), distortion_model=info.distortion_model
+            )
+        except FieldkitError as error:
+            hint = error.hint or "calibrate the camera, or correct the driver's CameraInfo"
+            raise BagError(f"{bag.path}: {topic}: {error.message}", hint=hint) from error
+    return cache[key]
+
+
+def _add_pose(content: Content, samples: PoseSamples, message: Any, value: Any, *, child: str) -> None:
+    p, q = value.position, value.orientation
+    try:
+        sample = pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    except FieldkitError:
+        content.refused["poses with impossible numbers"] += 1
+        return
+    samples.samples.append((stamp_ns(message.header), sample))
+    samples.parent = samples.parent or clean_frame(message.header.frame_id)
+    samples.child = samples.child or clean_frame(child)
+
+
+def _add_transforms(content: Content, transforms: Iterable[Any], *, static: bool) -> None:
+    for stamped in transforms:
+        p, q = stamped.transform.translation, stamped.transform.rotation
+        parent, child = stamped.header.frame_id, stamped.child_frame_id
+        xyz, quaternion = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
+        try:
+            if static:
+                content.tf.add_static(parent, child, xyz, quaternion)
+            else:
+                t_ns = stamp_ns(stamped.header)
+                content.tf.add(parent, child, t_ns, position_m=xyz, quaternion_xyzw=quaternion)
+        except FieldkitError:
+            content.refused["transforms with impossible numbers"] += 1

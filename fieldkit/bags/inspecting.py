@@ -1,0 +1,127 @@
+"""Say what is in a recording, as far as it can be read: made for recordings that cannot be replayed yet."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from fieldkit.bags.content import Content, collect
+from fieldkit.bags.events import Marks, find_marks
+from fieldkit.bags.files import BagFile
+from fieldkit.bags.layouts import LAYOUTS, Layout
+from fieldkit.bags.reading import (
+    check_sizes,
+    choose_layout,
+    general_warnings,
+    join_views,
+    make_frames,
+    open_source,
+    session_warnings,
+)
+from fieldkit.errors import BagError
+from fieldkit.types import Frame, Visit
+
+
+def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -> dict[str, Any]:
+    """Return what a recording holds and lacks as a dict for JSON; times in ns and s.
+
+    Keys: version, path, name, format, duration_s, n_messages, layout (None when none fits), topics, images, odometry,
+    reference, starts, visits, warnings, missing. Raises BagError only for a file that cannot be opened or is damaged.
+    """
+    source = open_source(path)
+    bag = source.bag
+    found = choose_layout(source, layout=layout)
+    used = found or LAYOUTS["generic"]
+    content = collect(bag, used)
+    missing = [] if found else [f"layout: none of {', '.join(LAYOUTS)} fits; looked for the topics of generic"]
+    marks = Marks()
+    try:
+        marks = find_marks(content.events, source.session, path=bag.path, t_end_ns=content.last_ns)
+    except BagError as error:
+        missing.append(str(error))
+    missing += _missing(used, content, marks)
+    warnings = list(marks.warnings)
+    odometry, repeated = content.odometry.trajectory(parent=used.odom_frame, child=used.body_frame)
+    warnings += general_warnings(bag, content, repeated)
+    frames: tuple[Frame, ...] = ()
+    visits: tuple[Visit, ...] = ()
+    unreached: list[str] = []
+    if content.cameras:
+        frames, unreached = make_frames(bag, content, camera_frame=used.camera_frame, body_frame=odometry.child)
+        visits = _visits(bag, content, marks, frames, missing=missing)
+    if visits and len(odometry):
+        warnings += session_warnings(visits, odometry, content)
+    if unreached:
+        warnings.append(f"tf does not reach the camera in {len(unreached)} images; the first: {unreached[0]}")
+    return {
+        "version": 1,
+        "path": str(path),
+        "name": source.name,
+        "format": bag.format,
+        "duration_s": bag.duration_ns / 1e9,
+        "n_messages": bag.n_messages,
+        "layout": None if found is None else found.name,
+        "topics": [{"name": n, "type": t.type, "count": t.count} for n, t in sorted(bag.topics.items())],
+        "images": _images(content, frames, n_unreached=len(unreached)),
+        "odometry": {"count": len(odometry), "parent": odometry.parent, "child": odometry.child},
+        "reference": {"count": len(content.reference.samples)},
+        "starts": [
+            {"tag_id": s.tag_id, "t_begin_ns": s.t_begin_ns, "t_end_ns": s.t_end_ns, "visit": s.visit}
+            for s in marks.starts
+        ],
+        "visits": _visit_rows(marks, visits),
+        "warnings": warnings,
+        "missing": missing,
+    }
+
+
+def _missing(layout: Layout, content: Content, marks: Marks) -> list[str]:
+    needed: list[tuple[object, str]] = [
+        (content.images, f"images on {layout.compressed} or {layout.image}"),
+        (content.cameras, f"camera_info on {layout.camera_info}"),
+        (content.tf.frames, f"tf on {layout.tf} or {layout.tf_static}"),
+        (content.odometry.samples, f"odometry on {layout.odometry}"),
+        (marks.visits, f"visits: events on {layout.events}, or [[visit]] in a session.toml beside the recording"),
+        (marks.starts, f"starts: events on {layout.events}, or [[start]] in a session.toml beside the recording"),
+    ]
+    return [what for values, what in needed if not values]
+
+
+def _visits(
+    bag: BagFile, content: Content, marks: Marks, frames: tuple[Frame, ...], *, missing: list[str]
+) -> tuple[Visit, ...]:
+    try:
+        if frames:
+            check_sizes(bag, content, frames)
+            return join_views(bag.path, marks, frames)[0]
+    except BagError as error:
+        missing.append(str(error))
+    return ()
+
+
+def _images(content: Content, frames: tuple[Frame, ...], *, n_unreached: int) -> dict[str, Any]:
+    sizes = Counter(f"{frame.camera.width}x{frame.camera.height} {frame.camera.model}" for frame in frames)
+    return {
+        "topic": content.image_topic,
+        "count": len(content.images),
+        "with_tf": len(frames) - n_unreached,
+        "without_tf": n_unreached,
+        "cameras": dict(sizes),
+    }
+
+
+def _visit_rows(marks: Marks, visits: tuple[Visit, ...]) -> list[dict[str, Any]]:
+    reached = {visit.id: sum(view.frame.body_from_cam is not None for view in visit.views) for visit in visits}
+    return [
+        {
+            "id": mark.id,
+            "t_begin_ns": mark.t_begin_ns,
+            "t_end_ns": mark.t_end_ns,
+            "next": mark.next,
+            "truth_tag_id": mark.truth_tag_id,
+            "views": dict(Counter(view.kind for view in marks.views if view.visit == mark.id)),
+            "views_with_tf": reached.get(mark.id, 0),
+        }
+        for mark in marks.visits
+    ]
