@@ -161,9 +161,8 @@ class _Reader:
             case "visit_end":
                 self._end_visit(t_ns, self._need(event, "visit", visit))
             case "start_begin":
-                tag_id = self._need(event, "tag_id", event.tag_id)
                 self._open_starts.append(len(self._starts))
-                self._starts.append(Start(tag_id, t_ns, -1, visit))
+                self._starts.append(Start(event.tag_id, t_ns, -1, visit))
             case "start_end":
                 self._end_start(t_ns, event.tag_id)
             case "view":
@@ -182,7 +181,7 @@ class _Reader:
             self._visits[name] = dataclasses.replace(mark, t_end_ns=closed(mark.t_begin_ns, f"visit {name}"))
         for index in self._open_starts:
             start = self._starts[index]
-            what = f"start at tag {start.tag_id}"
+            what = "start" if start.tag_id is None else f"start at tag {start.tag_id}"
             self._starts[index] = dataclasses.replace(start, t_end_ns=closed(start.t_begin_ns, what))
         views = sorted(self._views.values(), key=lambda v: v.t_ns)
         return Marks(tuple(self._starts), _by_time(self._visits.values()), tuple(views), tuple(self.warnings))
