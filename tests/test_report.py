@@ -20,7 +20,7 @@ from fieldkit import report
 from fieldkit.errors import ReportError
 from fieldkit.report import render, thumbnail_key, write_report
 from fieldkit.scores import summarize_run
-from fieldkit.types import Excluded, Run
+from fieldkit.types import Excluded, PlanView, Run
 
 VOID = {"meta", "link", "img", "br"}
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -131,9 +131,8 @@ def test_every_waypoint_lists_every_policy(run: Run, page: str) -> None:
 
 
 def test_policies_that_chose_the_same_view_share_its_picture(run: Run, page: str) -> None:
-    shown = {
-        (t.visit, t.view) for t in run.trials if t.view and t.policy not in ("random", "odometry") and t.weight > 0
-    }
+    # More than three tied views are summed up as an expectation, without pictures.
+    shown = {(t.visit, t.view) for t in run.trials if t.policy != "odometry" and t.weight > 0.3}
     assert page.count("data:image/jpeg;base64") == len(shown)
 
 
@@ -145,14 +144,7 @@ def test_failures_are_shown_with_their_reason(run: Run, page: str) -> None:
 
 
 def test_page_states_provenance_and_exclusions(run: Run, page: str) -> None:
-    for words in (
-        run.map_digest,
-        run.tags_digest,
-        "paper_real, version 1",
-        "body in the map",
-        "tripod tag",
-        "fieldkit 0.1.0",
-    ):
+    for words in (run.map_digest, run.tags_digest, "paper_real, version 1", "body in the map", "tripod tag"):
         assert words in page
     assert "<strong>visit w99</strong>: tripod tag 2 was not seen" in page
 
@@ -183,9 +175,7 @@ def test_run_without_a_scored_visit_still_says_why(run: Run) -> None:
 
 def test_run_without_pictures_and_landmarks_is_drawn(run: Run) -> None:
     nothing = run.plan_view.landmarks[:0]
-    bare = dataclasses.replace(
-        run, thumbnails={}, plan_view=dataclasses.replace(run.plan_view, landmarks=nothing, cameras=nothing)
-    )
+    bare = dataclasses.replace(run, thumbnails={}, plan_view=PlanView(nothing, nothing))
     assert "Map from above" in render([bare])
 
 
