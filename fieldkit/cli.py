@@ -51,10 +51,12 @@ def map_build(
     """
     from fieldkit import maps
 
+    options = maps.MapOptions(voxel_m=voxel_m)
     with _progress() as progress:
-        report = maps.build_map(source, out, feature=feature, voxel_m=voxel_m, force=force, progress=progress)
-    _print_mapping(maps.map_info(out), title=str(out))
-    del report
+        built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
+    for warning in built.warnings:
+        logging.getLogger(__name__).warning("%s: %s", source, warning)
+    _print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")
 
 
 def map_info(path: Positional[Path], *, json: bool = False) -> None:

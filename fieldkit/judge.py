@@ -12,14 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fieldkit import maps, store
 from fieldkit.errors import JudgeError
 from fieldkit.frames import Pose, Trajectory, log, pose_error
-from fieldkit.surface import nearest_distance, read_ply
-from fieldkit.types import Run, SceneMap, TagMap
+from fieldkit.surface import read_ply
+from fieldkit.types import Run, SceneMap, Surface, TagMap
 
 Array = NDArray[np.float64]
 LANDMARK_SAMPLE = 5000
@@ -89,9 +91,29 @@ def fit_gauge(scene_map: SceneMap, true_cameras: Mapping[str, Pose]) -> Gauge:
 def _landmark_median(scene_map: SceneMap, gauge: Gauge, path: Path) -> float | None:
     if not path.is_file() or not len(scene_map.xyz):
         return None
-    keep = np.random.default_rng(0).permutation(len(scene_map.xyz))[:LANDMARK_SAMPLE]
-    points = gauge.world_from_map.apply(scene_map.xyz[keep])
-    return float(np.median(nearest_distance(read_ply(path), points)))
+    rng = np.random.default_rng(0)
+    points = gauge.world_from_map.apply(scene_map.xyz[rng.permutation(len(scene_map.xyz))[:LANDMARK_SAMPLE]])
+    return float(np.median(nearest_distance(read_ply(path), points, rng=rng)))
+
+
+def nearest_distance(surface: Surface, points: Array, *, rng: np.random.Generator) -> Array:
+    """Return the distances (n,) in m of points (n, 3) to the nearest of the triangles near them.
+
+    The triangles of the 16 nearest of a million samples on the surface are tested exactly.
+    """
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    share = mesh.area_faces / mesh.area
+    face = rng.choice(len(share), size=1_000_000, p=share)
+    corner = rng.random((len(face), 2))
+    corner = np.where(corner.sum(axis=1, keepdims=True) > 1, 1 - corner, corner)
+    a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    samples = a + corner[:, :1] * (b - a) + corner[:, 1:] * (c - a)
+    _, near = cKDTree(samples).query(points, k=16)
+    triangles = mesh.triangles[face[near]].reshape(-1, 3, 3)
+    repeated = np.repeat(points, near.shape[1], axis=0)
+    closest = trimesh.triangles.closest_point(triangles, repeated)
+    distances: Array = np.linalg.norm(closest - repeated, axis=1).reshape(near.shape).min(axis=1)
+    return distances
 
 
 def _entry(keys: Mapping[str, Any], estimate: Pose, true: Pose, covariance: Array) -> dict[str, Any]:

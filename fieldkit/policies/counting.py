@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from fieldkit.policies.scene import Scene
 
 Array = NDArray[np.float64]
+# A direction exactly on the border of the mapped range counts, whatever the last bits of its angle are.
+ANGLE_SLACK_RAD = 1e-6
 
 
 def most_visible(scene: Scene) -> Array:
@@ -31,5 +33,7 @@ def viewing_angle(scene: Scene) -> Array:
         towards_cam = -map_from_cam.rotation.apply(x_in_cam) if len(index) else np.zeros((0, 3))
         towards_cam /= np.maximum(np.linalg.norm(towards_cam, axis=1), 1e-9)[:, None]
         cosine = np.sum(towards_cam * known.mean_direction[index], axis=1)
-        counts.append(np.count_nonzero(np.arccos(np.clip(cosine, -1.0, 1.0)) <= known.spread_rad[index]))
+        counts.append(
+            np.count_nonzero(np.arccos(np.clip(cosine, -1.0, 1.0)) <= known.spread_rad[index] + ANGLE_SLACK_RAD)
+        )
     return np.where(scene.candidates.allowed, np.array(counts, dtype=np.float64), -np.inf)
