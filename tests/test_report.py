@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 from synthetic_run import make_run
 
-from fieldkit import report
+from fieldkit import report, store
 from fieldkit.errors import ReportError
 from fieldkit.report import render, thumbnail_key, write_report
-from fieldkit.scores import summarize_run
+from fieldkit.scores import summarize_run, table
 from fieldkit.types import Excluded, PlanView, Run
 
 VOID = {"meta", "link", "img", "br"}
@@ -102,6 +102,13 @@ def test_every_reference_inside_the_page_has_its_target(page: str) -> None:
 
 def test_same_run_gives_the_same_page(run: Run, page: str) -> None:
     assert render([make_run(0)]) == page
+
+
+def test_stored_run_gives_the_same_table_and_page(run: Run, page: str, tmp_path: Path) -> None:
+    store.write_run(tmp_path / "run", run)
+    again = store.read_run(tmp_path / "run")
+    assert table(again).rows == table(run).rows
+    assert read(render([again])).texts == read(render([dataclasses.replace(run, path=str(tmp_path / "run"))])).texts
 
 
 def test_page_states_every_recall_with_its_interval(run: Run, page: str) -> None:

@@ -16,10 +16,10 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from fieldkit.frames import Pose
 from fieldkit.report.palette import style
+from fieldkit.report.visits import VisitRows
 from fieldkit.scores import ODOMETRY, cumulative, group
-from fieldkit.types import Run, Trial, VisitPlan
+from fieldkit.types import Run, Trial
 
 Array = NDArray[np.float64]
 SETTINGS: Any = {
@@ -81,14 +81,13 @@ def _plain_ticks(axes: Axes, low: float, high: float) -> None:
     axes.tick_params(which="minor", length=0)
 
 
-def plan_svg(run: Run, *, name: str) -> str:
+def plan_svg(run: Run, visits: Sequence[VisitRows], *, name: str) -> str:
     """Draw the map from above: landmarks, mapping cameras, waypoints at prior and truth, chosen directions.
 
     Parallel arrows of one waypoint are policies that chose the same view; a cross at the tip is a failed estimate.
     Priors are drawn with their 95 % ellipse.
     """
-    visits = [(plan, _true_body(run, plan)) for plan in run.plans]
-    low, high = _extent(run, [p for plan, true in visits for p in _positions(plan, true)])
+    low, high = _extent(run, [p for visit in visits for p in _positions(visit)])
     span = np.maximum(high - low, 1e-3)
     width = 9.6
     # The labels of the axes take 0.8 inches of the width and 0.6 of the height.
@@ -100,24 +99,17 @@ def plan_svg(run: Run, *, name: str) -> str:
         axes.scatter(landmarks[:, 0], landmarks[:, 1], s=1.1, color="#aab4bc", linewidths=0, rasterized=True, zorder=1)
         axes.scatter(cameras[:, 0], cameras[:, 1], s=10, marker="^", color="#7fb3d9", linewidths=0, rasterized=True)
         length = _arrow_length(visits, span)
-        for plan, true in visits:
-            _draw_waypoint(axes, plan, true, several=len(run.sessions) > 1)
-            _draw_choices(axes, run, (plan, true), length=length)
+        for visit in visits:
+            _draw_waypoint(axes, visit, several=len(run.sessions) > 1)
+            _draw_choices(axes, visit, order=run.protocol.policies, length=length)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x in the map (m)", ylabel="y in the map (m)")
         axes.set_aspect("equal")
         axes.spines[["top", "right"]].set_visible(False)
         return _svg(figure, name=name, label="Map from above with waypoints and chosen directions")
 
 
-def _positions(plan: VisitPlan, true: Pose | None) -> list[Array]:
-    return [p.translation[:2] for p in (plan.prior.map_from_body, true) if p is not None]
-
-
-def _true_body(run: Run, plan: VisitPlan) -> Pose | None:
-    for session, truth in run.truths:
-        if session == plan.session and truth.visit == plan.prior.visit:
-            return truth.map_from_cam * truth.body_from_cam.inv()
-    return None
+def _positions(visit: VisitRows) -> list[Array]:
+    return [p.translation[:2] for p in (visit.plan.prior.map_from_body, visit.map_from_body) if p is not None]
 
 
 def _extent(run: Run, positions: Sequence[Array]) -> tuple[Array, Array]:
@@ -133,8 +125,8 @@ def _extent(run: Run, positions: Sequence[Array]) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-def _arrow_length(visits: Sequence[tuple[VisitPlan, Pose | None]], span: Array) -> float:
-    points = np.array([_positions(plan, true)[-1] for plan, true in visits])
+def _arrow_length(visits: Sequence[VisitRows], span: Array) -> float:
+    points = np.array([_positions(visit)[-1] for visit in visits])
     length = 0.11 * float(span.max())
     if len(points) < 2:
         return length
@@ -144,7 +136,8 @@ def _arrow_length(visits: Sequence[tuple[VisitPlan, Pose | None]], span: Array) 
     )
 
 
-def _draw_waypoint(axes: Axes, plan: VisitPlan, true: Pose | None, *, several: bool) -> None:
+def _draw_waypoint(axes: Axes, visit: VisitRows, *, several: bool) -> None:
+    plan, true = visit.plan, visit.map_from_body
     prior = plan.prior.map_from_body
     here = prior.translation[:2]
     turn = prior.rotation.as_matrix()
@@ -174,13 +167,12 @@ def _draw_waypoint(axes: Axes, plan: VisitPlan, true: Pose | None, *, several: b
     )
 
 
-def _draw_choices(axes: Axes, run: Run, visit: tuple[VisitPlan, Pose | None], *, length: float) -> None:
-    plan, true = visit
-    base = _positions(plan, true)[-1]
-    truths = {t.view: t for s, t in run.truths if s == plan.session and t.visit == plan.prior.visit}
-    planned = dict(zip(plan.candidates.view_ids, plan.candidates.map_from_cam, strict=True))
-    for view, trials in _chosen_views(run, plan).items():
-        map_from_cam = truths[view].map_from_cam if view in truths else planned.get(view)
+def _draw_choices(axes: Axes, visit: VisitRows, *, order: Sequence[str], length: float) -> None:
+    base = _positions(visit)[-1]
+    planned = dict(zip(visit.plan.candidates.view_ids, visit.plan.candidates.map_from_cam, strict=True))
+    for view, trials in _chosen_views(visit, order).items():
+        truth = visit.truths.get(view)
+        map_from_cam = planned.get(view) if truth is None else truth.map_from_cam
         if map_from_cam is None:
             continue
         forward = map_from_cam.rotation.as_matrix()[:2, 2]
@@ -207,10 +199,9 @@ def _arrow(axes: Axes, start: Array, along: Array, trial: Trial) -> None:
     axes.plot(*end, marker=(3, 0, angle - 90), markersize=5, color=how.colour, linewidth=0, zorder=4)
 
 
-def _chosen_views(run: Run, plan: VisitPlan) -> dict[str, list[Trial]]:
+def _chosen_views(visit: VisitRows, order: Sequence[str]) -> dict[str, list[Trial]]:
     views: dict[str, list[Trial]] = {}
-    mine = [t for t in run.trials if (t.session, t.visit) == (plan.session, plan.prior.visit)]
-    for (policy, _), trials in group(mine, order=run.protocol.policies).items():
+    for (policy, _), trials in group(visit.trials, order=order).items():
         for trial in trials:
             if policy != ODOMETRY and trial.view and trial.weight >= SHOWN_WEIGHT:
                 views.setdefault(trial.view, []).append(trial)

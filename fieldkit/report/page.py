@@ -17,6 +17,7 @@ from fieldkit import protocol as protocols
 from fieldkit.protocol import Threshold
 from fieldkit.report import figures
 from fieldkit.report.palette import Style, style
+from fieldkit.report.visits import VisitRows, visit_rows
 from fieldkit.scores import (
     BEST_POSSIBLE,
     ODOMETRY,
@@ -27,10 +28,18 @@ from fieldkit.scores import (
     summarize_run,
     weighted_median,
 )
-from fieldkit.types import Run, Trial, Truth, ViewResult, VisitPlan
+from fieldkit.types import Run, Trial, Truth, ViewResult
 
 # Up to this many tied views are shown one by one; more are summed up as an expectation.
 MOST_TIED = 3
+TRUTH_NOTES = {
+    "tag": "The truth is relative to the map: tag photos and views share map and feature, so part of the map's warp "
+    "cancels. Neither the prior nor any estimate gates or initialises it; prior and truth still share the camera's "
+    "calibration, the kinematics and the odometry.",
+    "topic": "The truth is the pose topic of the recording, taken to be in the frame of the map; an offset between the "
+    "two counts as error of every policy.",
+    "simulation": "The truth is the simulator's own pose; part of every error is the warp of the map.",
+}
 POSES = {"cam": "camera", "body": "body"}
 
 
@@ -92,6 +101,7 @@ class Chapter:
     title: str
     subtitle: str
     facts: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...]
     protocol_json: str
     thresholds: tuple[str, ...]
     pose: str
@@ -109,6 +119,7 @@ def chapter(run: Run, number: int) -> Chapter:
     """Return what the page shows of a run; ``number`` keeps the anchors of several runs apart."""
     anchor = f"r{number}"
     summaries = summarize_run(run) if run.trials else ()
+    visits = visit_rows(run)
     best = _best(summaries)
     rows = [(s.policy, _table_row(s, best)) for s in summaries]
     name = PurePath(run.path).name or run.protocol.name
@@ -122,6 +133,7 @@ def chapter(run: Run, number: int) -> Chapter:
         title=name,
         subtitle=_subtitle(run),
         facts=_provenance(run),
+        notes=tuple(TRUTH_NOTES[s] for s in TRUTH_NOTES if s in {t.source for _, t in run.truths}),
         protocol_json=json.dumps(protocols.to_dict(run.protocol), indent=2),
         thresholds=tuple(_words(t) for t in run.protocol.thresholds),
         pose=POSES[run.protocol.pose],
@@ -130,8 +142,8 @@ def chapter(run: Run, number: int) -> Chapter:
         legend=tuple(style(s.policy, s.occlusion) for s in summaries),
         plan_legend=tuple(style(s.policy, s.occlusion) for s in summaries if s.policy not in (ODOMETRY, "random")),
         curves=curves,
-        plan=Markup(figures.plan_svg(run, name=f"{anchor}m")) if run.plans else None,
-        waypoints=tuple(_waypoint(run, plan, f"{anchor}w{i}") for i, plan in enumerate(run.plans)),
+        plan=Markup(figures.plan_svg(run, visits, name=f"{anchor}m")) if visits else None,
+        waypoints=tuple(_waypoint(run, visit, f"{anchor}w{i}") for i, visit in enumerate(visits)),
         excluded=tuple((e.what, e.reason) for e in run.excluded),
     )
 
@@ -161,7 +173,9 @@ def _count(n: int, noun: str) -> str:
 
 def _subtitle(run: Run) -> str:
     visits = _count(len(run.plans), "waypoint")
-    return f"{visits} in {_count(len(run.sessions), 'session')} · protocol {run.protocol.name}"
+    names = f"{'session' if len(run.sessions) == 1 else 'sessions'} {', '.join(run.sessions)}"
+    where = names if len(run.sessions) <= 3 else f"{len(run.sessions)} sessions"
+    return f"{visits} in {where} · protocol {run.protocol.name}"
 
 
 def _provenance(run: Run) -> tuple[tuple[str, str], ...]:
@@ -223,22 +237,19 @@ def _table_row(summary: Summary, best: tuple[float, ...]) -> TableRow:
     return TableRow(how, summary.n, cells, _metres(summary.median[0]), _degrees(summary.median[1]))
 
 
-def _waypoint(run: Run, plan: VisitPlan, anchor: str) -> Waypoint:
-    prior = plan.prior
-    key = (plan.session, prior.visit)
-    truths = [t for session, t in run.truths if (session, t.visit) == key]
-    results = {r.view: r for r in run.results if (r.session, r.visit) == key}
-    trials = [t for t in run.trials if (t.session, t.visit) == key]
+def _waypoint(run: Run, visit: VisitRows, anchor: str) -> Waypoint:
+    plan, prior = visit.plan, visit.plan.prior
+    seen = f", {_count(prior.n_sightings, 'sighting')} of the start tag" if prior.n_sightings else ""
     spread = [math.sqrt(float(np.trace(prior.covariance[i : i + 3, i : i + 3]))) for i in (3, 0)]
     facts = (
         ("Prior error", _both(plan.prior_error)),
         ("Prior's own sigma", _both(spread)),
-        ("Travelled since the start tag", f"{prior.travelled_m:.1f} m ({_count(prior.n_sightings, 'sighting')} of it)"),
-        ("Truth", _truth_of(truths)),
-        ("Candidates", f"{int(plan.candidates.allowed.sum())} of {_count(len(results), 'localized view')}"),
+        ("Travelled since the start", f"{prior.travelled_m:.1f} m{seen}"),
+        ("Truth", _truth_of(tuple(visit.truths.values()))),
+        ("Candidates", f"{int(plan.candidates.allowed.sum())} of {_count(len(visit.results), 'recorded view')}"),
     )
     title = f"{plan.session} · {prior.visit}" if len(run.sessions) > 1 else prior.visit
-    return Waypoint(anchor, title, facts, _choices(run, trials, results), _all_views(run, trials, results))
+    return Waypoint(anchor, title, facts, _choices(run, visit), _all_views(run, visit))
 
 
 def _truth_of(truths: Sequence[Truth]) -> str:
@@ -248,11 +259,11 @@ def _truth_of(truths: Sequence[Truth]) -> str:
     return f"{', '.join(sorted({t.source for t in truths}))}; median sigma {_both((position, rotation))}"
 
 
-def _choices(run: Run, trials: Sequence[Trial], results: Mapping[str, ViewResult]) -> tuple[Choice, ...]:
+def _choices(run: Run, visit: VisitRows) -> tuple[Choice, ...]:
     """One row per distinct outcome, in the order of the policies; those that chose the same view share a row."""
     rows: dict[tuple[str, str], list[tuple[Trial, str]]] = {}
     expectations: dict[tuple[str, str], list[Trial]] = {}
-    for (policy, occlusion), mine in group(trials, order=run.protocol.policies).items():
+    for (policy, occlusion), mine in group(visit.trials, order=run.protocol.policies).items():
         weighted = [t for t in mine if t.weight > 0]
         if len(weighted) > MOST_TIED:
             rows[f"{policy} {occlusion}", "expectation"] = []
@@ -263,7 +274,7 @@ def _choices(run: Run, trials: Sequence[Trial], results: Mapping[str, ViewResult
             special = policy if policy == ODOMETRY or not trial.view else "view"
             rows.setdefault((trial.view, special), []).append((trial, share))
     return tuple(
-        _expectation(run, expectations[key]) if key in expectations else _choice(run, chosen, results)
+        _expectation(run, expectations[key]) if key in expectations else _choice(run, chosen, visit.results)
         for key, chosen in rows.items()
     )
 
@@ -323,10 +334,10 @@ def _verdict(run: Run, trial: Trial) -> tuple[str, Literal["good", "fair", "poor
     return "outside all thresholds", "poor"
 
 
-def _all_views(run: Run, trials: Sequence[Trial], results: Mapping[str, ViewResult]) -> tuple[Choice, ...]:
+def _all_views(run: Run, visit: VisitRows) -> tuple[Choice, ...]:
     """Every candidate with its outcome, as far as the run holds it: the rows of best possible."""
-    rows = [t for t in trials if t.policy == BEST_POSSIBLE and t.view]
-    return tuple(dataclasses.replace(_choice(run, [(t, "")], results), picture=None) for t in rows)
+    rows = [t for t in visit.trials if t.policy == BEST_POSSIBLE and t.view]
+    return tuple(dataclasses.replace(_choice(run, [(t, "")], visit.results), picture=None) for t in rows)
 
 
 def _picture(run: Run, trial: Trial) -> str | None:
