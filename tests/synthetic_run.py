@@ -67,7 +67,7 @@ def make_visit(
         failed = bool(rng.random() < fail)
         estimate = Estimate(
             None if failed else truths[view].map_from_cam * noise, None if failed else covariance,
-            int(rng.integers(20, 300)), 0 if failed else int(rng.integers(12, 200)),
+            int(rng.integers(200, 300)), 0 if failed else int(rng.integers(12, 200)),
             "few_inliers" if failed else "ok", 0.0 if failed else 0.9, {"extract": 0.05, "pnp": 0.01},
         )  # fmt: skip
         results[view] = ViewResult(session, visit, view, KINDS[i], 1_000_000_000 * i, estimate)

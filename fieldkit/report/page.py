@@ -308,7 +308,7 @@ def _expectation(run: Run, trials: Sequence[Trial]) -> Choice:
         pose: [weighted_median([error_of(t, pose=pose)[i] for t in trials], weights) for i in (0, 1)]
         for pose in ("cam", "body")
     }
-    bound = run.protocol.thresholds[-1]
+    bound = max(run.protocol.thresholds, key=lambda t: (t.position_m, t.rotation_deg))
     share = math.fsum(t.weight * inside(error_of(t, pose=run.protocol.pose), bound) for t in trials)
     failed = sum(not math.isfinite(t.cam_error[0]) for t in trials)
     return Choice(
