@@ -114,16 +114,20 @@ class BagFile:
         raise BagError(f"{self.path}: the message at {place.log_ns} ns of {connection.topic} is gone")
 
     def _open_reader(self) -> Any:
+        for database in [self.path] if self.path.suffix == ".db3" else sorted(self.path.glob("*.db3")):
+            _check_sqlite(database)
         reader = rosbag1.Reader(self.path) if self.format == "ros1" else rosbag2.Reader(self.path)
         reader.open()
         return reader
 
     def _guard(self, call: Callable[[], T]) -> T:
-        # A damaged file makes the decoders below fail with whatever they meet; every such failure is the file's
+        # A damaged file makes the decoders fail with whatever they meet, a MemoryError for an absurd length among them
         try:
             return call()
-        except (PermissionError, MemoryError):
-            raise
+        except PermissionError as error:
+            raise BagError(
+                f"{self.path}: cannot be read; expected permission", hint="check the file's owner"
+            ) from error
         except Exception as error:
             reason = str(error) or type(error).__name__
             raise BagError(
@@ -179,6 +183,16 @@ def _check_path(path: Path) -> None:
         raise BagError(f"{path}: unknown kind of file {path.suffix!r}; {EXPECTED}", hint="name a recording")
     if path.stat().st_size == 0:
         raise BagError(f"{path}: the file is empty (0 bytes); expected a recording", hint="copy or record it again")
+
+
+def _check_sqlite(path: Path) -> None:
+    """Raise ValueError where a file is shorter than its header says; SQLite would fill up the last page with zeros."""
+    with path.open("rb") as stream:
+        header = stream.read(100)
+    page = int.from_bytes(header[16:18], "big")
+    expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
+    if len(header) < 100 or path.stat().st_size < expected:
+        raise ValueError(f"{path.name} has {path.stat().st_size} of {expected} bytes")
 
 
 def _register(store: Typestore, connection: Connection) -> bool:
