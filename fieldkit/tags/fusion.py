@@ -1,0 +1,294 @@
+"""One tag seen by several cameras whose poses are known with some noise: consensus, then one least-squares problem."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.cameras import Camera
+from fieldkit.errors import TagError
+from fieldkit.frames import Pose, compose_covariance, exp
+from fieldkit.tags.detect import TagDetection
+from fieldkit.tags.pose import TagSolution, project_derivative, solve, tag_corners
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Squared deviation of one sighting (6 or 8 degrees of freedom) beyond which it is an outlier
+GATE = 40.0
+# Difference of two solutions' chi-square below which neither is certain: odds of e^10
+CERTAIN = 20.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sighting:
+    """A tag in one image, and where that camera was: ref_from_cam with its own 6x6 covariance (right perturbation)."""
+
+    detection: TagDetection
+    camera: Camera
+    ref_from_cam: Pose
+    covariance: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class TagFix:
+    """A tag's pose in the reference frame, fused from sightings, with its 6x6 covariance (right perturbation).
+
+    ``used``, ``sigmas`` and ``ambiguities`` have one entry per sighting: whether it entered, its deviation from the
+    result in standard deviations per degree of freedom, and its own ambiguity. ``flipped`` marks sightings whose own
+    better solution is not the one that all together chose. ``scale`` multiplies the stated standard deviations of the
+    camera poses: their noise as the sightings show it. ``alternative`` is the other solution, when there is one,
+    ``ambiguity`` the ratio of the two residuals, and ``evidence`` the difference of their chi-squares.
+    """
+
+    ref_from_tag: Pose
+    covariance: Array
+    rms_px: float
+    used: tuple[bool, ...]
+    sigmas: tuple[float, ...]
+    ambiguities: tuple[float, ...]
+    flipped: tuple[bool, ...]
+    scale: float
+    alternative: Pose | None = None
+    alternative_covariance: Array | None = None
+    ambiguity: float = 0.0
+    evidence: float = float("inf")
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the sightings decide between the two solutions."""
+        return self.evidence > CERTAIN
+
+
+def fuse_sightings(
+    sightings: Sequence[Sighting], size_m: float, *, scales: Sequence[float] = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+) -> TagFix:
+    """Fuse sightings of one tag of edge ``size_m`` into ref_from_tag.
+
+    Both planar solutions of every sighting vote for a consensus; then one generalised least-squares problem over all
+    corners of the sightings that agree. Each sighting's 8 residuals have the corners' noise plus the noise of its
+    camera pose, which is what solving for all camera poses as well, with their covariances as priors, gives after
+    eliminating them. The camera noise may be multiplied by one of ``scales``, the most likely one (from 4 sightings
+    on). The covariance is scaled by chi-square per degree of freedom where that exceeds 1. Errors that all sightings
+    share (hand-to-camera calibration, tag size, a warp of the map) are not in it.
+    Raises TagError when there is no sighting.
+    """
+    if not sightings:
+        raise TagError("no sighting of the tag; expected at least one")
+    points = tag_corners(size_m)
+    problem = _Problem.of(sightings, points)
+    solutions = [solve(s.detection, s.camera, size_m) for s in sightings]
+    votes = _vote(sightings, solutions)
+    scale = max(1.0, votes.scale) if max(scales) >= 1.0 else max(scales)
+    best, used, scale = _settle(problem, votes.first, votes.agrees, scale, scales)
+    chi2 = problem.chi2(best, scale)
+    factor = max(1.0, float(chi2[used].sum()) / max(8 * int(used.sum()) - 6, 1))
+    covariance = np.linalg.inv(problem.information(best, used, scale)) * factor
+    fix = TagFix(
+        best,
+        (covariance + covariance.T) / 2,
+        problem.rms_px(best, used),
+        tuple(bool(u) for u in used),
+        tuple(float(np.sqrt(c / 8)) for c in chi2),
+        tuple(s.ambiguity for s in solutions),
+        tuple(_is_flipped(s, o, best) for s, o in zip(sightings, solutions, strict=True)),
+        scale,
+    )
+    return _with_alternative(fix, problem, votes.others, used, factor)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Problem:
+    """Corners of n sightings as arrays: undistorted xy (n, 4, 2), focal, noise, cam_from_ref and its covariance."""
+
+    points: Array
+    xy: Array
+    focal: Array
+    sigma: Array
+    rotation: Array
+    translation: Array
+    covariance: Array
+
+    @staticmethod
+    def of(sightings: Sequence[Sighting], points: Array) -> _Problem:
+        cam_from_ref = [s.ref_from_cam.inv() for s in sightings]
+        return _Problem(
+            points,
+            np.stack([s.camera.unproject(s.detection.corners_px)[:, :2] for s in sightings]),
+            np.array([s.camera.focal_px for s in sightings]),
+            np.array([s.detection.sigma_px for s in sightings]),
+            np.stack([p.rotation.as_matrix() for p in cam_from_ref]),
+            np.stack([p.translation for p in cam_from_ref]),
+            np.stack([s.covariance for s in sightings]),
+        )
+
+    def linearise(self, ref_from_tag: Pose) -> tuple[Array, Array, Array]:
+        """Return residuals (n, 8) in pixels, their derivative by the tag (n, 8, 6) and by the cameras (n, 8, 6)."""
+        n = len(self.xy)
+        rotation = ref_from_tag.rotation.as_matrix()
+        x_in_ref = self.points @ rotation.T + ref_from_tag.translation
+        x_in_cam = np.einsum("nij,kj->nki", self.rotation, x_in_ref) + self.translation[:, None]
+        by_tag, by_cam = np.zeros((n, 4, 3, 6)), np.zeros((n, 4, 3, 6))
+        cam_from_tag = self.rotation @ rotation
+        by_tag[..., :3] = -np.einsum("nij,kjl->nkil", cam_from_tag, _skews(self.points))
+        by_tag[..., 3:] = cam_from_tag[:, None]
+        by_cam[..., :3] = _skews(x_in_cam.reshape(-1, 3)).reshape(n, 4, 3, 3)
+        by_cam[..., 3:] = -np.eye(3)
+        in_front = np.maximum(x_in_cam[..., 2:], 1e-3)
+        predicted = x_in_cam[..., :2] / in_front * self.focal[:, None]
+        slope = np.stack(
+            [
+                project_derivative(np.column_stack([x[:, :2], z]), f)
+                for x, z, f in zip(x_in_cam, in_front, self.focal, strict=True)
+            ]
+        )
+        residual = (self.xy * self.focal[:, None] - predicted).reshape(n, 8)
+        return residual, (slope @ by_tag).reshape(n, 8, 6), (slope @ by_cam).reshape(n, 8, 6)
+
+    def weights(self, by_cam: Array, scale: float) -> tuple[Array, Array]:
+        """Return the inverse covariance (n, 8, 8) of each sighting's residuals and its log determinant (n,)."""
+        noise = self.sigma[:, None, None] ** 2 * np.eye(8)
+        total = noise + scale**2 * by_cam @ self.covariance @ by_cam.transpose(0, 2, 1)
+        return np.linalg.inv(total), np.linalg.slogdet(total)[1]
+
+    def chi2(self, ref_from_tag: Pose, scale: float) -> Array:
+        """Return the squared deviation (n,) of each sighting."""
+        residual, _, by_cam = self.linearise(ref_from_tag)
+        return np.einsum("ni,nij,nj->n", residual, self.weights(by_cam, scale)[0], residual)
+
+    def cost(self, ref_from_tag: Pose, used: Mask, scale: float) -> float:
+        """Return twice the negative log likelihood of the sightings that are used, up to a constant."""
+        _, _, by_cam = self.linearise(ref_from_tag)
+        return float((self.chi2(ref_from_tag, scale) + self.weights(by_cam, scale)[1])[used].sum())
+
+    def information(self, ref_from_tag: Pose, used: Mask, scale: float) -> Array:
+        """Return the 6x6 information of the sightings that are used."""
+        _, by_tag, by_cam = self.linearise(ref_from_tag)
+        weights = self.weights(by_cam, scale)[0]
+        return np.einsum("nai,nab,nbj->ij", by_tag[used], weights[used], by_tag[used])
+
+    def rms_px(self, ref_from_tag: Pose, used: Mask) -> float:
+        """Return the root mean square of the residuals per coordinate in pixels."""
+        return float(np.sqrt(np.mean(self.linearise(ref_from_tag)[0][used] ** 2)))
+
+    def minimise(self, start: Pose, used: Mask, scale: float) -> Pose:
+        """Minimise the weighted residuals from a start by Levenberg-Marquardt; weights follow the pose."""
+        pose, damping = start, 1e-6
+        cost = float(self.chi2(pose, scale)[used].sum())
+        for _ in range(40):
+            residual, by_tag, by_cam = self.linearise(pose)
+            weighted = np.einsum("nab,nbj->naj", self.weights(by_cam, scale)[0], by_tag)[used]
+            normal = np.einsum("nai,naj->ij", by_tag[used], weighted)
+            gradient = np.einsum("nai,na->i", weighted, residual[used])
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            candidate = pose * exp(step)
+            new = float(self.chi2(candidate, scale)[used].sum())
+            if new < cost:
+                gain, pose, cost, damping = cost - new, candidate, new, max(damping / 10, 1e-12)
+                if gain < 1e-10 * (1.0 + cost):
+                    break
+            elif damping > 1e6 or float(np.abs(step).max()) < 1e-11:
+                break
+            else:
+                damping *= 10
+        return pose
+
+
+@dataclasses.dataclass(frozen=True)
+class _Votes:
+    """The candidate that most sightings agree with, who agrees, at what noise scale, and the candidates after it."""
+
+    first: Pose
+    agrees: Mask
+    scale: float
+    others: tuple[Pose, ...]
+
+
+def _vote(sightings: Sequence[Sighting], solutions: Sequence[TagSolution]) -> _Votes:
+    """Let every solution of every sighting be a candidate, and every sighting vote with its closer solution.
+
+    The noise scale is the smallest of a few at which more than half of the sightings agree with the best candidate.
+    """
+    owners, poses, covariances, penalties = [], [], [], []
+    for index, (sighting, solution) in enumerate(zip(sightings, solutions, strict=True)):
+        better = solution.rms_px**2, solution.cam_from_tag, solution.covariance
+        both = [better]
+        if solution.alternative is not None and solution.alternative_covariance is not None:
+            both.append((solution.alternative_rms_px**2, solution.alternative, solution.alternative_covariance))
+        for square, cam_from_tag, covariance in both:
+            owners.append(index)
+            poses.append(sighting.ref_from_cam * cam_from_tag)
+            covariances.append(compose_covariance(sighting.covariance, cam_from_tag, covariance))
+            penalties.append(8 * (square - solution.rms_px**2) / sighting.detection.sigma_px**2)
+    distance = np.stack([_distances(poses, covariances, j) for j in range(len(poses))], axis=1)
+    penalty, owner, n = np.array(penalties), np.array(owners), len(sightings)
+    for scale in (1.0, 2.0, 4.0, 8.0, 16.0):
+        per_candidate = np.minimum(distance / scale**2 + penalty[:, None], GATE)
+        votes = np.stack([per_candidate[owner == i].min(axis=0) for i in range(n)])
+        order = np.argsort(votes.sum(axis=0) + np.minimum(penalty, GATE), kind="stable")
+        agrees: Mask = votes[:, order[0]] < GATE
+        if 2 * int(agrees.sum()) > n:
+            break
+    return _Votes(poses[order[0]], agrees, scale, tuple(poses[k] for k in order[1:]))
+
+
+def _distances(poses: Sequence[Pose], covariances: Sequence[Array], j: int) -> Array:
+    stack = Pose.concatenate(list(poses))
+    delta = stack.inv() * poses[j]
+    tangent = np.concatenate([delta.rotation.as_rotvec(), delta.translation], axis=1)
+    total = np.stack(covariances) + covariances[j]
+    return np.einsum("ni,ni->n", tangent, np.linalg.solve(total, tangent[..., None])[..., 0])
+
+
+def _settle(
+    problem: _Problem, start: Pose, agrees: Mask, scale: float, scales: Sequence[float]
+) -> tuple[Pose, Mask, float]:
+    """Alternate between the pose, the scale of the cameras' noise, and who is within the gate."""
+    pose, used = start, agrees
+    for _ in range(6):
+        pose = problem.minimise(pose, used, scale)
+        if int(used.sum()) >= 4:
+            scale = min(scales, key=lambda s: (problem.cost(pose, used, s), s))
+            pose = problem.minimise(pose, used, scale)
+        chi2 = problem.chi2(pose, scale)
+        now: Mask = chi2 < GATE * max(1.0, float(np.median(chi2[used])) / 8)
+        if not now.any() or (now == used).all():
+            break
+        used = now
+    return pose, used, scale
+
+
+def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], used: Mask, factor: float) -> TagFix:
+    """Look for the other solution among the remaining candidates: another minimum of the same problem."""
+    best = float(problem.chi2(fix.ref_from_tag, fix.scale)[used].sum())
+    for start in [p for p in others if (fix.ref_from_tag.inv() * p).rotation.magnitude() > 0.03][:4]:
+        other = problem.minimise(start, used, fix.scale)
+        if (fix.ref_from_tag.inv() * other).rotation.magnitude() < 0.02:
+            continue
+        cost = float(problem.chi2(other, fix.scale)[used].sum())
+        covariance = np.linalg.inv(problem.information(other, used, fix.scale)) * factor
+        return dataclasses.replace(
+            fix,
+            alternative=other,
+            alternative_covariance=(covariance + covariance.T) / 2,
+            ambiguity=float(np.sqrt(min(best, cost) / max(best, cost, 1e-12))),
+            evidence=(cost - best) / factor,
+        )
+    return fix
+
+
+def _is_flipped(sighting: Sighting, solution: TagSolution, ref_from_tag: Pose) -> bool:
+    if solution.alternative is None:
+        return False
+    cam_from_tag = sighting.ref_from_cam.inv() * ref_from_tag
+    own, other = solution.cam_from_tag, solution.alternative
+    return bool((cam_from_tag.inv() * other).rotation.magnitude() < (cam_from_tag.inv() * own).rotation.magnitude())
+
+
+def _skews(v: Array) -> Array:
+    result = np.zeros((len(v), 3, 3))
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return result - result.transpose(0, 2, 1)
