@@ -47,6 +47,23 @@ def test_moving_transform_is_interpolated_between_samples_in_any_order_of_arriva
     assert_same(buffer.lookup("body", "hand", t_ns=SECOND // 2), second)
 
 
+def test_many_times_at_once_give_what_each_gives_alone(rng: np.random.Generator) -> None:
+    buffer = TfBuffer()
+    put(buffer, "hand", "camera", random_pose(rng))
+    for i in range(20):
+        put(buffer, "body", "hand", random_pose(rng), t_ns=i * SECOND // (2 if i > 10 else 5))
+    stamps = [int(t) for t in rng.integers(-SECOND, 11 * SECOND, size=50)]
+    together = buffer.lookup_all("body", "camera", t_ns=stamps)
+    assert {type(found) for found in together} == {Pose, FrameError}
+    for t_ns, found in zip(stamps, together, strict=True):
+        if isinstance(found, FrameError):
+            with pytest.raises(FrameError) as alone:
+                buffer.lookup("body", "camera", t_ns=t_ns)
+            assert str(alone.value) == str(found)
+        else:
+            assert_same(buffer.lookup("body", "camera", t_ns=t_ns), found)
+
+
 def test_static_transform_holds_at_every_time_and_the_last_one_counts(rng: np.random.Generator) -> None:
     buffer, new = TfBuffer(), random_pose(rng)
     put(buffer, "hand", "camera", random_pose(rng))

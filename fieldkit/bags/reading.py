@@ -16,7 +16,7 @@ from fieldkit.bags.images import decode_image
 from fieldkit.bags.layouts import LAYOUTS, ROBOT, Layout, detect_layout, find_layout, fit_layout
 from fieldkit.cameras import Camera
 from fieldkit.errors import BagError, FrameError
-from fieldkit.frames import Trajectory
+from fieldkit.frames import Pose, Trajectory
 from fieldkit.store import SessionFile, read_session
 from fieldkit.types import Frame, Image, Recording, View, Visit
 
@@ -112,15 +112,20 @@ def make_frames(
     bag: BagFile, content: Content, *, camera_frame: str, body_frame: str
 ) -> tuple[tuple[Frame, ...], list[str]]:
     """Return a frame per image in the order of stamps, and why tf did not reach the body, per frame without it."""
+    by_frame: dict[str, list[int]] = {}
+    for index, image in enumerate(content.images):
+        by_frame.setdefault(image.frame or camera_frame, []).append(index)
+    reached: dict[int, Pose | FrameError] = {}
+    for name, indices in by_frame.items():
+        stamps = [content.images[i].t_ns for i in indices]
+        reached |= zip(indices, content.tf.lookup_all(body_frame, name, t_ns=stamps), strict=True)
     frames, unreached = [], []
-    for image in content.images:
-        camera, body_from_cam = content.camera_at(image.t_ns), None
-        try:
-            body_from_cam = content.tf.lookup(body_frame, image.frame or camera_frame, t_ns=image.t_ns)
-        except FrameError as error:
-            unreached.append(error.message)
+    for index, image in enumerate(content.images):
+        camera, found = content.camera_at(image.t_ns), reached[index]
+        if isinstance(found, FrameError):
+            unreached.append(found.message)
         read = functools.partial(read_image, bag, image.place, camera)
-        frames.append(Frame(image.t_ns, camera, body_from_cam, read))
+        frames.append(Frame(image.t_ns, camera, None if isinstance(found, FrameError) else found, read))
     return tuple(frames), unreached
 
 

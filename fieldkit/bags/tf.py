@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import FrameError
-from fieldkit.frames import Pose, interpolate
+from fieldkit.frames import Pose
 
 
 def clean_frame(name: str) -> str:
@@ -38,10 +38,6 @@ class _Track:
             stamps, first = np.unique(np.array(self.t_ns, dtype=np.int64), return_index=True)
             self._ordered = stamps, np.array(self.rows, dtype=np.float64)[first]
         return self._ordered
-
-
-def _pose(row: Sequence[float] | NDArray[np.float64]) -> Pose:
-    return Pose.from_components(np.asarray(row[:3]), Rotation.from_quat(np.asarray(row[3:])))
 
 
 class TfBuffer:
@@ -81,7 +77,30 @@ class TfBuffer:
         Raises FrameError that names the frames when they are not connected, when the time lies before the first or
         after the last sample of a transform on the way, or in a gap longer than ``max_gap_ns``.
         """
-        target, source = clean_frame(target), clean_frame(source)
+        found = self.lookup_all(target, source, t_ns=[t_ns])[0]
+        if isinstance(found, FrameError):
+            raise found
+        return found
+
+    def lookup_all(self, target: str, source: str, *, t_ns: Sequence[int]) -> list[Pose | FrameError]:
+        """Return target_from_source for many times at once; where `lookup` would raise, the error stands instead."""
+        found: dict[int, Pose | FrameError] = {}
+        groups: dict[tuple[tuple[str, ...], tuple[str, ...]], list[int]] = {}
+        for index, t in enumerate(t_ns):
+            try:
+                groups.setdefault(self._way(clean_frame(target), clean_frame(source), t), []).append(index)
+            except FrameError as error:
+                found[index] = error
+        for (down, up), indices in groups.items():
+            stamps = np.array([t_ns[i] for i in indices], dtype=np.int64)
+            errors: dict[int, FrameError] = {}
+            poses = self._climb(down, stamps, errors).inv() * self._climb(up, stamps, errors)
+            for place, index in enumerate(indices):
+                found[index] = errors[place] if place in errors else poses[place]
+        return [found[index] for index in range(len(t_ns))]
+
+    def _way(self, target: str, source: str, t_ns: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the frames from target, and from source, up to the first that they have in common."""
         up_source, up_target = self._ancestors(source, t_ns), self._ancestors(target, t_ns)
         common = next((frame for frame in up_source if frame in up_target), None)
         if common is None:
@@ -90,9 +109,8 @@ class TfBuffer:
                 f"tf does not connect {source!r} (below {up_source[-1]!r}) with {target!r} (below {up_target[-1]!r}); "
                 f"frames: {known or 'none'}"
             )
-        common_from_source = self._climb(up_source[: up_source.index(common) + 1], t_ns)
-        common_from_target = self._climb(up_target[: up_target.index(common) + 1], t_ns)
-        return common_from_target.inv() * common_from_source
+        up, down = up_source[: up_source.index(common) + 1], up_target[: up_target.index(common) + 1]
+        return tuple(down), tuple(up)
 
     def _ancestors(self, frame: str, t_ns: int) -> list[str]:
         chain = [frame]
@@ -113,28 +131,44 @@ class TfBuffer:
         past = {p: int(stamps[np.searchsorted(stamps, t_ns, side="right") - 1]) for p, stamps in latest.items()}
         return max(past, key=lambda p: (past[p] <= t_ns, past[p]))
 
-    def _climb(self, chain: list[str], t_ns: int) -> Pose:
-        result = Pose.identity()
+    def _climb(self, chain: Sequence[str], stamps: NDArray[np.int64], errors: dict[int, FrameError]) -> Pose:
+        result = Pose.identity(len(stamps))
         for child, parent in itertools.pairwise(chain):
-            result = self._sample(parent, child, t_ns) * result
+            result = self._sample(parent, child, stamps, errors) * result
         return result
 
-    def _sample(self, parent: str, child: str, t_ns: int) -> Pose:
+    def _sample(self, parent: str, child: str, stamps: NDArray[np.int64], errors: dict[int, FrameError]) -> Pose:
+        """Return parent_from_child at every stamp; where there is none, note why, and put any pose in its place."""
         track = self._moving.get(child, {}).get(parent)
         if track is None:
-            return _pose(self._static[child][1])
-        stamps, rows = track.ordered()
-        right = int(np.searchsorted(stamps, t_ns))
-        if right < len(stamps) and stamps[right] == t_ns:
-            return _pose(rows[right])
-        what = f"tf {parent!r} from {child!r} at {t_ns / 1e9:.3f} s"
-        if right in (0, len(stamps)):
-            span = f"{stamps[0] / 1e9:.3f} .. {stamps[-1] / 1e9:.3f} s"
-            raise FrameError(f"{what}: outside of its samples {span}; it is never extrapolated")
-        t0, t1 = int(stamps[right - 1]), int(stamps[right])
-        if t1 - t0 > self.max_gap_ns:
-            raise FrameError(f"{what}: in a gap of {(t1 - t0) / 1e9:.2f} s; at most {self.max_gap_ns / 1e9:.2f} s")
-        return interpolate(_pose(rows[right - 1]), _pose(rows[right]), (t_ns - t0) / (t1 - t0))
+            return _poses(np.array([self._static[child][1]]))
+        times, rows = track.ordered()
+        right = np.minimum(np.searchsorted(times, stamps), len(times) - 1)
+        left = np.where(times[right] == stamps, right, np.maximum(right - 1, 0))
+        outside = (stamps < times[0]) | (stamps > times[-1])
+        gap = ~outside & (times[right] - times[left] > self.max_gap_ns)
+        for place in np.flatnonzero(outside | gap):
+            what = f"tf {parent!r} from {child!r} at {stamps[place] / 1e9:.3f} s"
+            span_s = (times[right[place]] - times[left[place]]) / 1e9
+            why = (
+                f"outside of its samples {times[0] / 1e9:.3f} .. {times[-1] / 1e9:.3f} s; it is never extrapolated"
+                if outside[place]
+                else f"in a gap of {span_s:.2f} s; at most {self.max_gap_ns / 1e9:.2f} s"
+            )
+            errors.setdefault(int(place), FrameError(f"{what}: {why}"))
+        fraction = np.where(outside, 0.0, (stamps - times[left]) / np.maximum(times[right] - times[left], 1))
+        return _between(_poses(rows[left]), _poses(rows[right]), fraction[:, None])
+
+
+def _poses(rows: NDArray[np.float64]) -> Pose:
+    return Pose.from_components(rows[:, :3], Rotation.from_quat(rows[:, 3:]))
+
+
+def _between(first: Pose, second: Pose, fraction: NDArray[np.float64]) -> Pose:
+    """Return the poses between n pairs, as `fieldkit.frames.interpolate` does for one pair; fraction is (n, 1)."""
+    turn = (first.rotation.inv() * second.rotation).as_rotvec()
+    xyz = (1.0 - fraction) * first.translation + fraction * second.translation
+    return Pose.from_components(xyz, first.rotation * Rotation.from_rotvec(fraction * turn))
 
 
 def _row(
