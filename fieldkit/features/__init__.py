@@ -76,7 +76,7 @@ def extract(
     kind = feature_kind(feature)
     grey = to_grey(image)
     height, width = grey.shape
-    factor = 1.0 if max_side_px is None else min(1.0, max_side_px / max(height, width))
+    factor = working_factor((height, width), max_side_px=max_side_px)
     if factor < 1.0:
         size = max(round(width * factor), 1), max(round(height * factor), 1)
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -86,6 +86,11 @@ def extract(
         keypoints = keypoints * np.array([sx, sy], dtype=np.float32)
         scales = scales * np.float32(math.sqrt(sx * sy))
     return Features(keypoints, scores, scales, descriptors)
+
+
+def working_factor(shape: tuple[int, ...], *, max_side_px: int | None) -> float:
+    """Return by how much `extract` reduces an image of shape (h, w) first: 1 or less."""
+    return 1.0 if max_side_px is None else min(1.0, max_side_px / max(shape[:2]))
 
 
 def to_grey(image: Image) -> Image:

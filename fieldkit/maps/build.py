@@ -37,7 +37,7 @@ class MapOptions:
     max_keypoints: int = 2048
     max_image_size: int | None = 1600
     ratio: float = 0.8
-    n_similar: int = 12
+    n_similar: int = 20
     n_neighbours: int = 3
     min_registered: float = 0.5
     landmarks: LandmarkRules = LandmarkRules()

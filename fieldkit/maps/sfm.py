@@ -140,6 +140,12 @@ def _mapping_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     options.min_model_size = 3
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
+    # Tighter than COLMAP's defaults: with few pairs per image loose ones let a room bend at its weakest link.
+    options.mapper.init_max_error = 2.0
+    options.mapper.abs_pose_max_error = 6.0
+    options.mapper.filter_max_reproj_error = 3.0
+    options.triangulation.merge_max_reproj_error = 3.0
+    options.triangulation.complete_max_reproj_error = 3.0
     return options
 
 

@@ -1,0 +1,135 @@
+"""PnP with covariance: RANSAC by COLMAP, then a refinement that knows how uncertain every landmark is."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from fieldkit.frames import Pose, exp
+
+Array = NDArray[np.float64]
+
+# Beyond this many sigmas a residual counts less (Huber).
+_HUBER = 2.5
+_NOISE_PX = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedPoints:
+    """Matches of a query: undistorted pixels from the principal point (n, 2), landmarks (n, 3), their covariances
+    (n, 3, 3), and the focal lengths in px."""
+
+    pixels: Array
+    xyz: Array
+    xyz_covariance: Array
+    focal_px: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Solved:
+    """map_from_cam, its 6x6 covariance (right perturbation, rotation first), and bool[n] inliers."""
+
+    map_from_cam: Pose
+    covariance: Array
+    inliers: NDArray[np.bool_]
+
+
+def estimate_pose(points: PosedPoints, *, max_error_px: float, seed: int) -> Solved | None:
+    """Estimate a camera pose from matches of which many may be wrong; None when no pose is found.
+
+    The same points and seed give the same bits.
+    """
+    start = _ransac(points, max_error_px=max_error_px, seed=seed)
+    if start is None:
+        return None
+    refined, covariance = refine_pose(_subset(points, start.inliers), start.map_from_cam)
+    residual, x_in_cam = _residuals(points, refined)
+    inliers = (np.linalg.norm(residual, axis=1) <= max_error_px) & (x_in_cam[:, 2] > 0)
+    return Solved(refined, covariance, inliers)
+
+
+def _ransac(points: PosedPoints, *, max_error_px: float, seed: int) -> Solved | None:
+    (fx, fy), extent = points.focal_px, 2.0 * float(np.abs(points.pixels).max()) + 1.0
+    size = int(np.ceil(extent))
+    camera = pycolmap.Camera(model="PINHOLE", width=size, height=size, params=[fx, fy, 0.0, 0.0])
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = max_error_px
+    options.ransac.random_seed = seed
+    options.ransac.num_threads = 1
+    found = pycolmap.estimate_and_refine_absolute_pose(points.pixels, points.xyz, camera, options)
+    if found is None:
+        return None
+    matrix = np.vstack([found["cam_from_world"].matrix(), [0.0, 0.0, 0.0, 1.0]])
+    inliers = np.asarray(found["inlier_mask"], dtype=bool)
+    if inliers.sum() < 4 or not np.isfinite(matrix).all():
+        return None
+    return Solved(Pose.from_matrix(matrix).inv(), np.zeros((6, 6)), inliers)
+
+
+def refine_pose(points: PosedPoints, map_from_cam: Pose, *, iterations: int = 10) -> tuple[Pose, Array]:
+    """Refine a pose on its inliers by Gauss-Newton and return it with its 6x6 covariance.
+
+    Every residual is weighted by its own 2x2 covariance: 1 px of noise plus the landmark's uncertainty projected
+    into the image; large residuals count less (Huber). The covariance is the inverse information, scaled by the
+    residuals' robust variance when they are larger than expected.
+    """
+    for _ in range(iterations):
+        jacobian, whitened = _linearized(points, map_from_cam)
+        norm = np.linalg.norm(whitened, axis=1)
+        gain = np.where(norm <= _HUBER, 1.0, _HUBER / np.maximum(norm, 1e-12))
+        information = np.einsum("n,nki,nkj->ij", gain, jacobian, jacobian)
+        step = np.linalg.lstsq(information, -np.einsum("n,nki,nk->i", gain, jacobian, whitened), rcond=None)[0]
+        map_from_cam = map_from_cam * exp(step)
+        if float(np.abs(step).max()) < 1e-10:
+            break
+    jacobian, whitened = _linearized(points, map_from_cam)
+    norm = np.linalg.norm(whitened, axis=1)
+    gain = np.where(norm <= _HUBER, 1.0, _HUBER / np.maximum(norm, 1e-12))
+    information = np.einsum("n,nki,nkj->ij", gain, jacobian, jacobian)
+    # The median of a two-dimensional unit normal's squared length is 2 ln 2.
+    excess = float(np.median(norm**2)) / (2.0 * np.log(2.0))
+    covariance = np.linalg.pinv(information) * max(excess, 0.25)
+    return map_from_cam, 0.5 * (covariance + covariance.T)
+
+
+def _residuals(points: PosedPoints, map_from_cam: Pose) -> tuple[Array, Array]:
+    x_in_cam = map_from_cam.inv().apply(points.xyz)
+    depth = np.maximum(x_in_cam[:, 2:], 1e-6)
+    return x_in_cam[:, :2] / depth * points.focal_px - points.pixels, x_in_cam
+
+
+def _linearized(points: PosedPoints, map_from_cam: Pose) -> tuple[Array, Array]:
+    """Return whitened Jacobians (n, 2, 6) by the right perturbation of map_from_cam, and whitened residuals (n, 2)."""
+    residual, x_in_cam = _residuals(points, map_from_cam)
+    x, y, z = x_in_cam[:, 0], x_in_cam[:, 1], np.maximum(x_in_cam[:, 2], 1e-6)
+    (fx, fy), zero = points.focal_px, np.zeros(len(x_in_cam))
+    by_point = np.stack(
+        [np.stack([fx / z, zero, -fx * x / z**2], axis=1), np.stack([zero, fy / z, -fy * y / z**2], axis=1)], axis=1
+    )
+    # x_in_cam of map_from_cam * Exp(w, v) is x_in_cam + [x_in_cam]x w - v to first order.
+    cross = np.zeros((len(x), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -x_in_cam[:, 2], x_in_cam[:, 1], -x_in_cam[:, 0]
+    cross -= cross.transpose(0, 2, 1)
+    jacobian = np.concatenate([by_point @ cross, -by_point], axis=2)
+    by_landmark = by_point @ map_from_cam.inv().rotation.as_matrix()
+    covariance = by_landmark @ points.xyz_covariance @ by_landmark.transpose(0, 2, 1) + _NOISE_PX**2 * np.eye(2)
+    lower = np.linalg.cholesky(covariance)
+    solved = np.linalg.solve(lower, np.concatenate([jacobian, residual[:, :, None]], axis=2))
+    return solved[:, :, :6], solved[:, :, 6]
+
+
+def _subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
+    return PosedPoints(points.pixels[rows], points.xyz[rows], points.xyz_covariance[rows], points.focal_px)
+
+
+def confidence(inliers_px: NDArray[np.float32], size: tuple[int, int]) -> float:
+    """Return 0..1 from how many cells of a 16 x 16 grid over the image hold an inlier: half at 15 cells.
+
+    Wrong poses have few inliers, or many on one repeated object; right ones have them all over the image.
+    """
+    cells = np.floor(inliers_px / (np.asarray(size) / 16.0)).astype(int)
+    occupied = len(np.unique(cells, axis=0))
+    return float(1.0 / (1.0 + np.exp(-(occupied - 15.0) / 3.0)))

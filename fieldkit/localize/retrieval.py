@@ -1,0 +1,64 @@
+"""Which mapping images look like the query: global descriptors made of the map's own landmark descriptors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.features import Descriptors
+from fieldkit.features.vlad import Vocabulary, global_descriptor, train_vocabulary
+from fieldkit.types import SceneMap
+
+Ints = NDArray[np.int32]
+
+
+@dataclasses.dataclass(frozen=True)
+class Index:
+    """A global descriptor f32[k, w] per mapping image, and the rows of ``descriptors`` that describe it.
+
+    In a full map these are the image's own descriptors. In a compact map, where a landmark keeps one descriptor,
+    they are those of the landmarks that the image observes.
+    """
+
+    vocabulary: Vocabulary
+    vectors: NDArray[np.float32]
+    rows: tuple[Ints, ...]
+
+
+def build_index(scene_map: SceneMap, *, seed: int) -> Index:
+    """Index a map for `most_similar`; the vocabulary is trained on its own descriptors."""
+    rows = image_rows(scene_map)
+    vocabulary = train_vocabulary(scene_map.descriptors, seed=seed)
+    vectors = np.stack([global_descriptor(vocabulary, scene_map.descriptors[r]) for r in rows])
+    return Index(vocabulary, vectors, rows)
+
+
+def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
+    """Return per mapping image the descriptor of every landmark it observes: its own, else the landmark's first."""
+    first = np.full(len(scene_map.xyz), -1, dtype=np.int32)
+    landmarks, positions = np.unique(scene_map.descriptor_landmark, return_index=True)
+    first[landmarks] = positions
+    count = len(scene_map.image_names)
+    seen = _grouped(scene_map.observation_image, count)
+    own = _grouped(scene_map.descriptor_image, count)
+    result = []
+    for i in range(count):
+        chosen = first[np.unique(scene_map.observation_landmark[seen[i]])]
+        borrowed = chosen[chosen >= 0]
+        described = scene_map.descriptor_landmark[own[i]]
+        borrowed = borrowed[~np.isin(scene_map.descriptor_landmark[borrowed], described)]
+        result.append(np.concatenate([own[i], borrowed]).astype(np.int32))
+    return tuple(result)
+
+
+def most_similar(index: Index, descriptors: Descriptors, *, count: int) -> Ints:
+    """Return the indices of the mapping images most similar to an image with these descriptors, best first."""
+    similarity = index.vectors @ global_descriptor(index.vocabulary, descriptors)
+    return np.argsort(-similarity, kind="stable")[:count].astype(np.int32)
+
+
+def _grouped(owner: Ints, count: int) -> list[NDArray[np.int64]]:
+    order = np.argsort(owner, kind="stable")
+    return np.split(order, np.searchsorted(owner[order], np.arange(1, count)))
