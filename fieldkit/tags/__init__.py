@@ -2,6 +2,23 @@
 
 from fieldkit.tags.detect import FAMILIES, TagDetection, detect
 from fieldkit.tags.drawing import draw_tag
+from fieldkit.tags.fusion import Sighting, TagFix, fuse_sightings
 from fieldkit.tags.pose import TagSolution, solve, tag_corners
+from fieldkit.tags.sightings import ARM_COVARIANCE, BodySightings, body_in_map, body_sightings
 
-__all__ = ["FAMILIES", "TagDetection", "TagSolution", "detect", "draw_tag", "solve", "tag_corners"]
+__all__ = [
+    "ARM_COVARIANCE",
+    "FAMILIES",
+    "BodySightings",
+    "Sighting",
+    "TagDetection",
+    "TagFix",
+    "TagSolution",
+    "body_in_map",
+    "body_sightings",
+    "detect",
+    "draw_tag",
+    "fuse_sightings",
+    "solve",
+    "tag_corners",
+]

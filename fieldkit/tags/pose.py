@@ -119,7 +119,7 @@ def _planar(xy: Array, points: Array) -> list[Pose]:
 
 
 def _refine(start: Pose, xy: Array, points: Array, focal: Array) -> tuple[Pose, Array, Array]:
-    """Minimise the pixel residuals from a start by Levenberg-Marquardt; return pose, residuals (8,), Jacobian (8, 6)."""
+    """Minimise the pixel residuals by Levenberg-Marquardt; return pose, residuals (8,) and Jacobian (8, 6)."""
     cam_from_tag, damping = start, 1e-6
     predicted, derivative = project_tag(cam_from_tag, points, focal)
     residual, jacobian = (xy * focal - predicted).ravel(), derivative.reshape(-1, 6)
