@@ -16,6 +16,7 @@ from mcap.writer import Writer as McapFile
 from numpy.typing import ArrayLike
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2.metadata import dump_qos_v8
 from rosbags.typesys.store import Typestore
 
 from fieldkit.bags.files import ros1_types, ros2_types
@@ -40,16 +41,6 @@ _LATCHED = Qos(
     _NO_TIME,
     False,
 )
-_LATCHED_YAML = """- history: keep_last
-  depth: 1
-  reliability: reliable
-  durability: transient_local
-  deadline: {sec: 0, nsec: 0}
-  lifespan: {sec: 0, nsec: 0}
-  liveliness: automatic
-  liveliness_lease_duration: {sec: 0, nsec: 0}
-  avoid_ros_namespace_conventions: false
-"""
 
 
 class _Container(Protocol):
@@ -121,6 +112,8 @@ class _McapBag:
         self._stream = path.open("xb")
         self._writer = McapFile(self._stream)
         self._writer.start(profile="ros2", library="fieldkit")
+        # By this record rosbag2 knows that the profiles of the topics are in the notation before version 9
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": ""})
 
     def write(self, topic: str, message: Any, t_ns: int) -> None:
         kind = message.__msgtype__
@@ -128,7 +121,7 @@ class _McapBag:
             if kind not in self._schemas:
                 definition, _ = self.store.generate_msgdef(kind, ros_version=2)
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
-            metadata = {"offered_qos_profiles": _LATCHED_YAML if topic in self._latched else ""}
+            metadata = {"offered_qos_profiles": dump_qos_v8([_LATCHED] if topic in self._latched else [])}
             self._topics[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], metadata)
         data = bytes(self.store.serialize_cdr(message, kind))
         count = self._counts[topic] = self._counts.get(topic, 0) + 1
