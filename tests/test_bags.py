@@ -518,6 +518,7 @@ def test_uncalibrated_camera_info_is_refused(tmp_path: Path) -> None:
     _rewrite(path, changed, lambda topic, data: data.replace(zeros, bytes(len(zeros))))
     with pytest.raises(BagError, match=r"changed\.mcap: /arm_camera/camera_info: CameraInfo has focal lengths 0, 0"):
         open_recording(changed)
+    assert any("focal lengths 0, 0" in what for what in inspect_recording(changed)["missing"])
 
 
 def test_tf_that_misses_some_images_warns_and_leaves_none(tmp_path: Path) -> None:

@@ -63,6 +63,7 @@ class Content:
     joints: list[tuple[int, dict[str, float]]] = dataclasses.field(default_factory=list)
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
     last_ns: int = 0
+    camera_error: BagError | None = None
 
     def camera_at(self, t_ns: int) -> Camera:
         """Return the calibration whose stamp is nearest; the later one when two are equally near."""
@@ -83,7 +84,10 @@ def image_topic(bag: BagFile, layout: Layout) -> str:
 
 
 def collect(bag: BagFile, layout: Layout) -> Content:
-    """Read everything on a layout's topics once. Raises BagError for a damaged bag or an impossible CameraInfo."""
+    """Read everything on a layout's topics once. Raises BagError for a damaged bag.
+
+    A CameraInfo that cannot be used is kept as ``camera_error``: whoever needs cameras raises it.
+    """
     content = Content(image_topic(bag, layout))
     cache: dict[tuple[Any, ...], Camera] = {}
     topics = {content.image_topic, layout.camera_info, layout.odometry, layout.tf, layout.tf_static}
@@ -100,7 +104,10 @@ def collect(bag: BagFile, layout: Layout) -> Content:
                 ImagePlace(stamp_ns(value.header), clean_frame(value.header.frame_id), size, message.place)
             )
         elif message.topic == layout.camera_info and kind == "sensor_msgs/msg/CameraInfo":
-            content.cameras.append((stamp_ns(value.header), _camera(bag, layout.camera_info, value, cache)))
+            try:
+                content.cameras.append((stamp_ns(value.header), _camera(bag, layout.camera_info, value, cache)))
+            except BagError as error:
+                content.camera_error = content.camera_error or error
         elif message.topic == layout.odometry and kind == "nav_msgs/msg/Odometry":
             _add_pose(content, content.odometry, value, value.pose.pose, child=value.child_frame_id)
         elif message.topic == layout.reference and kind == "geometry_msgs/msg/PoseStamped":

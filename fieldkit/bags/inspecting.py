@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
         marks = find_marks(content.events, source.session, path=bag.path, t_end_ns=content.last_ns)
     except BagError as error:
         missing.append(str(error))
+    if content.camera_error is not None:
+        missing.append(str(content.camera_error))
     missing += _missing(used, content, marks)
     warnings = list(marks.warnings)
     odometry, repeated = content.odometry.trajectory(parent=used.odom_frame, child=used.body_frame)
@@ -66,10 +69,7 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
         "images": _images(content, frames, n_unreached=len(unreached)),
         "odometry": {"count": len(odometry), "parent": odometry.parent, "child": odometry.child},
         "reference": {"count": len(content.reference.samples)},
-        "starts": [
-            {"tag_id": s.tag_id, "t_begin_ns": s.t_begin_ns, "t_end_ns": s.t_end_ns, "visit": s.visit}
-            for s in marks.starts
-        ],
+        "starts": [dataclasses.asdict(start) for start in marks.starts],
         "visits": _visit_rows(marks, visits),
         "warnings": warnings,
         "missing": missing,

@@ -227,6 +227,8 @@ def _require_content(bag: BagFile, layout: Layout, content: Content) -> None:
         "tf": (content.tf.frames, f"{layout.tf} or {layout.tf_static}", "tf2_msgs/TFMessage"),
         "odometry": (content.odometry.samples, layout.odometry, "nav_msgs/Odometry with finite poses"),
     }
+    if content.camera_error is not None:
+        raise content.camera_error
     for what, (values, topic, kind) in found.items():
         if not values:
             raise BagError(
