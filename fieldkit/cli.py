@@ -162,12 +162,15 @@ def localize(
         json: print JSON with status, inliers, covariance and seconds per image
         force: replace an existing file
     """
-    from fieldkit import store
-    from fieldkit.localize import localize_images
+    from fieldkit import maps, store
+    from fieldkit.localize import Localizer
+    from fieldkit.localize.files import localize_files
 
     store.refuse_existing(out, force=force)
+    calibration = store.read_camera(camera)
+    localizer = Localizer(maps.load_map(map))
     with _progress() as progress:
-        found = localize_images(images, map_path=map, camera=store.read_camera(camera), progress=progress)
+        found = localize_files(localizer, images, calibration, progress=progress)
     store.write_tum(out, [(n.replace(" ", "_"), e.map_from_cam) for n, e in found if e.map_from_cam is not None])
     failed = [f"{n} ({e.status})" for n, e in found if e.map_from_cam is None]
     if failed:
