@@ -158,7 +158,7 @@ def _cell_px(corners: Array, cells: int) -> float:
     """Return the height of a cell across the longest edge: what foreshortening leaves of it."""
     (ax, ay), (bx, by) = corners[2] - corners[0], corners[3] - corners[1]
     longest = float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).max())
-    return max(abs(ax * by - ay * bx) / 2 / longest / cells, 0.1)
+    return max(float(abs(ax * by - ay * bx)) / 2 / longest / cells, 0.1)
 
 
 def _edge_points(grey: Image, corners: Array, i: int, cells: int) -> Array:

@@ -37,6 +37,7 @@ class Sighting:
 class TagFix:
     """A tag's pose in the reference frame, fused from sightings, with its 6x6 covariance (right perturbation).
 
+    ``rms_px`` is what remains in the corners once the cameras have moved within their noise.
     ``used``, ``sigmas`` and ``ambiguities`` have one entry per sighting: whether it entered, its deviation from the
     result in standard deviations per degree of freedom, and its own ambiguity. ``flipped`` marks sightings whose own
     better solution is not the one that all together chose. ``scale`` multiplies the stated standard deviations of the
@@ -90,7 +91,7 @@ def fuse_sightings(
     fix = TagFix(
         best,
         (covariance + covariance.T) / 2,
-        problem.rms_px(best, used),
+        problem.rms_px(best, used, scale),
         tuple(bool(u) for u in used),
         tuple(float(np.sqrt(c / 8)) for c in chi2),
         tuple(s.ambiguity for s in solutions),
@@ -152,12 +153,13 @@ class _Problem:
         """Return the inverse covariance (n, 8, 8) of each sighting's residuals and its log determinant (n,)."""
         noise = self.sigma[:, None, None] ** 2 * np.eye(8)
         total = noise + scale**2 * by_cam @ self.covariance @ by_cam.transpose(0, 2, 1)
-        return np.linalg.inv(total), np.linalg.slogdet(total)[1]
+        return np.asarray(np.linalg.inv(total)), np.asarray(np.linalg.slogdet(total)[1])
 
     def chi2(self, ref_from_tag: Pose, scale: float) -> Array:
         """Return the squared deviation (n,) of each sighting."""
         residual, _, by_cam = self.linearise(ref_from_tag)
-        return np.einsum("ni,nij,nj->n", residual, self.weights(by_cam, scale)[0], residual)
+        result: Array = np.einsum("ni,nij,nj->n", residual, self.weights(by_cam, scale)[0], residual)
+        return result
 
     def cost(self, ref_from_tag: Pose, used: Mask, scale: float) -> float:
         """Return twice the negative log likelihood of the sightings that are used, up to a constant."""
@@ -168,11 +170,17 @@ class _Problem:
         """Return the 6x6 information of the sightings that are used."""
         _, by_tag, by_cam = self.linearise(ref_from_tag)
         weights = self.weights(by_cam, scale)[0]
-        return np.einsum("nai,nab,nbj->ij", by_tag[used], weights[used], by_tag[used])
+        result: Array = np.einsum("nai,nab,nbj->ij", by_tag[used], weights[used], by_tag[used])
+        return result
 
-    def rms_px(self, ref_from_tag: Pose, used: Mask) -> float:
-        """Return the root mean square of the residuals per coordinate in pixels."""
-        return float(np.sqrt(np.mean(self.linearise(ref_from_tag)[0][used] ** 2)))
+    def rms_px(self, ref_from_tag: Pose, used: Mask, scale: float) -> float:
+        """Return the root mean square per coordinate of what remains in the corners, in pixels.
+
+        The cameras have moved within their noise to fit: of a residual r with covariance S, sigma^2 S^-1 r remains.
+        """
+        residual, _, by_cam = self.linearise(ref_from_tag)
+        remains = self.sigma[:, None] ** 2 * np.einsum("nab,nb->na", self.weights(by_cam, scale)[0], residual)
+        return float(np.sqrt(np.mean(remains[used] ** 2)))
 
     def minimise(self, start: Pose, used: Mask, scale: float) -> Pose:
         """Minimise the weighted residuals from a start by Levenberg-Marquardt; weights follow the pose."""
@@ -240,7 +248,8 @@ def _distances(poses: Sequence[Pose], covariances: Sequence[Array], j: int) -> A
     delta = stack.inv() * poses[j]
     tangent = np.concatenate([delta.rotation.as_rotvec(), delta.translation], axis=1)
     total = np.stack(covariances) + covariances[j]
-    return np.einsum("ni,ni->n", tangent, np.linalg.solve(total, tangent[..., None])[..., 0])
+    result: Array = np.einsum("ni,ni->n", tangent, np.linalg.solve(total, tangent[..., None])[..., 0])
+    return result
 
 
 def _settle(

@@ -143,5 +143,5 @@ def _refine(start: Pose, xy: Array, points: Array, focal: Array) -> tuple[Pose, 
 
 
 def _covariance(jacobian: Array, sigma_px: float) -> Array:
-    covariance: Array = np.linalg.inv(jacobian.T @ jacobian) * sigma_px**2
+    covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian) * sigma_px**2, dtype=np.float64)
     return (covariance + covariance.T) / 2

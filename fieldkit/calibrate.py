@@ -1,0 +1,289 @@
+"""Photos of tags and a map in, the tags' poses in the map out."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from fieldkit.cameras import Camera
+from fieldkit.errors import TagError
+from fieldkit.localize import Localizer
+from fieldkit.maps import load_map
+from fieldkit.protocol import LocalizerRules
+from fieldkit.store import read_camera, read_photos
+from fieldkit.tags import Sighting, TagDetection, TagFix, detect, fuse_sightings
+from fieldkit.types import Estimate, Image, SceneMap, TagMap, TagPhoto, TagPose
+
+Progress = Callable[[str, int, int], None]
+log = logging.getLogger(__name__)
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
+# A photo's covariance says how well its matches fit, not how far their landmarks are off together: it may be scaled up
+PHOTO_SCALES = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
+# A tag known worse than this, 1 sigma per axis, deserves a warning
+WARN_SIGMA_M, WARN_SIGMA_RAD = 0.01, math.radians(0.5)
+
+
+def parse_sizes(texts: Sequence[str]) -> dict[int | None, float]:
+    """Parse sizes in m: ``0.1365`` for every tag (key None), ``3:0.30`` for tag 3. Raises TagError."""
+    sizes: dict[int | None, float] = {}
+    for text in texts:
+        head, colon, tail = text.rpartition(":")
+        try:
+            tag_id, size_m = (int(head) if colon else None), float(tail)
+        except ValueError:
+            tag_id, size_m = None, math.nan
+        if not math.isfinite(size_m) or size_m <= 0:
+            raise TagError(
+                f"--size-m {text}: not a tag size; expected metres (0.1365) or ID:METRES (3:0.30)",
+                hint="measure the edge of the tag's black square",
+            )
+        if tag_id in sizes:
+            raise TagError(f"--size-m {text}: given twice for {'every tag' if tag_id is None else f'tag {tag_id}'}")
+        if not 0.01 <= size_m <= 3.0:
+            raise TagError(f"--size-m {text}: {size_m:g} m is no tag's edge; expected metres, 0.01 to 3")
+        sizes[tag_id] = size_m
+    if not sizes:
+        raise TagError("no tag size; expected --size-m METRES", hint="measure the edge of the tag's black square")
+    return sizes
+
+
+def calibrate_tags(
+    photos: Path,
+    map_path: Path,
+    *,
+    camera: Path | None = None,
+    sizes_m: Mapping[int | None, float],
+    families: Sequence[str] = ("tag36h11",),
+    rules: LocalizerRules | None = None,
+    progress: Progress | None = None,
+) -> TagMap:
+    """Find map_from_tag of every tag in a folder of photos, with covariance and a verdict on every photo.
+
+    The folder holds photos.toml, or photos of one camera (``camera``, else camera.toml in the folder). ``sizes_m`` as
+    `parse_sizes` returns it. A tag whose photos all name a visit gets one pose per visit; one that is also in photos
+    without a visit is fixed, and all its photos count. Raises TagError, StoreError or LocalizeError.
+    """
+    listed = _list_photos(Path(photos), camera)
+    scene_map = load_map(Path(map_path))
+    shots, rejected = _find_tags(Path(photos), listed, sizes_m, families, progress)
+    located, failed = _localize(shots, scene_map, rules, progress)
+    rejected += failed
+    verdicts: list[TagPhoto] = []
+    tags: list[TagPose] = []
+    for (tag_id, family, visit), group in sorted(_groups(located).items(), key=lambda g: (g[0][0], str(g[0][1:]))):
+        size_m = sizes_m[tag_id] if tag_id in sizes_m else sizes_m[None]
+        fix = fuse_sightings([s.sighting for s in group], size_m, scales=PHOTO_SCALES)
+        tags.append(_tag_pose(fix, tag_id, family, size_m, visit))
+        verdicts += [_photo_verdict(s, fix, index, visit) for index, s in enumerate(group)]
+    if not tags:
+        reasons = sorted({f"{p.file}: {p.reason}" for p in rejected})
+        raise TagError(
+            f"{photos}: no photo of a tag could be localized in {map_path} ({reasons[0]}); expected at least one",
+            hint="take photos that show the tag and much of its mapped surroundings",
+        )
+    _warn(tags, verdicts + rejected)
+    order = {p.file: i for i, p in enumerate(listed)}
+    everything = sorted(verdicts + rejected, key=lambda p: (order[p.file], p.tag_id))
+    return TagMap(tuple(tags), tuple(everything), scene_map.digest)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Photo:
+    file: str
+    path: Path
+    camera: Camera
+    camera_path: Path
+    visit: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shot:
+    """A photo and the tags in it that can be calibrated."""
+
+    photo: _Photo
+    detections: tuple[TagDetection, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Located:
+    photo: _Photo
+    sighting: Sighting
+
+
+def _list_photos(folder: Path, camera: Path | None) -> list[_Photo]:
+    if not folder.is_dir():
+        raise TagError(f"{folder}: no such folder; expected a folder with photos of tags")
+    if (folder / "photos.toml").is_file():
+        entries = read_photos(folder / "photos.toml")
+        paths = {e.camera: camera or folder / e.camera for e in entries}
+        cameras = {name: read_camera(path) for name, path in paths.items()}
+        listed = [_Photo(e.file, folder / e.file, cameras[e.camera], paths[e.camera], e.visit) for e in entries]
+    else:
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES)
+        path = camera or folder / "camera.toml"
+        if files and not path.is_file():
+            raise TagError(
+                f"{path}: no such camera file; expected the calibration of the photos in {folder}",
+                hint="give it with --camera, or list the photos and their cameras in photos.toml",
+            )
+        found = read_camera(path) if files else None
+        listed = [] if found is None else [_Photo(p.name, p, found, path) for p in files]
+    if not listed:
+        raise TagError(f"{folder}: holds no photo; expected .jpg or .png files, or photos.toml")
+    for photo in listed:
+        if not photo.path.is_file():
+            raise TagError(f"{photo.path}: no such photo; expected it, since photos.toml lists it")
+    return listed
+
+
+def _read_photo(photo: _Photo) -> Image | None:
+    # The sensor's pixels, as calibrated: a rotation noted in EXIF would swap the camera's axes
+    image = cv2.imread(str(photo.path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        return None
+    height, width = image.shape[:2]
+    if (width, height) != (photo.camera.width, photo.camera.height):
+        raise TagError(
+            f"{photo.path}: {width}x{height} pixels; expected {photo.camera.width}x{photo.camera.height} as in "
+            f"{photo.camera_path}",
+            hint="give the calibration of this camera at this resolution, not rotated or resized",
+        )
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _find_tags(
+    folder: Path,
+    listed: Sequence[_Photo],
+    sizes_m: Mapping[int | None, float],
+    families: Sequence[str],
+    progress: Progress | None,
+) -> tuple[list[_Shot], list[TagPhoto]]:
+    shots: list[_Shot] = []
+    rejected: list[TagPhoto] = []
+    seen: set[int] = set()
+    for number, photo in enumerate(listed):
+        if progress is not None:
+            progress("find tags", number, len(listed))
+        image = _read_photo(photo)
+        found = [] if image is None else detect(image, photo.camera, families=families)
+        if not found:
+            reason = "cannot be read as an image" if image is None else "no tag found"
+            rejected.append(TagPhoto(photo.file, -1, used=False, reason=reason, visit=photo.visit))
+        ids = [d.id for d in found]
+        usable = []
+        for d in found:
+            seen.add(d.id)
+            if None not in sizes_m and d.id not in sizes_m:
+                reason = "no size given for this tag"
+            elif ids.count(d.id) > 1:
+                reason = "the same id is seen twice in the photo"
+            else:
+                usable.append(d)
+                continue
+            rejected.append(TagPhoto(photo.file, d.id, used=False, reason=reason, visit=photo.visit))
+        if usable:
+            shots.append(_Shot(photo, tuple(usable)))
+    if not seen:
+        raise TagError(
+            f"{folder}: none of the {len(listed)} photos shows a tag of {', '.join(families)} (for example "
+            f"{listed[0].file}: {rejected[0].reason}); expected the tags to be calibrated",
+            hint="check the family, and that the tag is whole, sharp and at least 30 pixels wide",
+        )
+    if not shots:
+        raise TagError(
+            f"{folder}: no tag can be used; tags {sorted(seen)} are seen, sizes are given for {_keys(sizes_m)}"
+        )
+    return shots, rejected
+
+
+def _keys(sizes_m: Mapping[int | None, float]) -> list[int | str]:
+    return [k if k is not None else "every tag" for k in sizes_m]
+
+
+def _localize(
+    shots: Sequence[_Shot], scene_map: SceneMap, rules: LocalizerRules | None, progress: Progress | None
+) -> tuple[list[_Located], list[TagPhoto]]:
+    localizer = Localizer(scene_map, rules or LocalizerRules())
+    located: list[_Located] = []
+    failed: list[TagPhoto] = []
+    for number, shot in enumerate(shots):
+        if progress is not None:
+            progress("localize photos", number, len(shots))
+        image = _read_photo(shot.photo)
+        assert image is not None
+        estimate: Estimate = localizer.localize(image, shot.photo.camera)
+        for d in shot.detections:
+            if estimate.map_from_cam is None or estimate.covariance is None:
+                reason = f"not localized ({estimate.status}, {estimate.n_inliers} inliers)"
+                failed.append(TagPhoto(shot.photo.file, d.id, used=False, reason=reason, visit=shot.photo.visit))
+            else:
+                sighting = Sighting(d, shot.photo.camera, estimate.map_from_cam, estimate.covariance)
+                located.append(_Located(shot.photo, sighting))
+    return located, failed
+
+
+def _groups(located: Sequence[_Located]) -> dict[tuple[int, str, str | None], list[_Located]]:
+    fixed = {s.sighting.detection.id for s in located if s.photo.visit is None}
+    groups: dict[tuple[int, str, str | None], list[_Located]] = {}
+    for s in located:
+        d = s.sighting.detection
+        groups.setdefault((d.id, d.family, None if d.id in fixed else s.photo.visit), []).append(s)
+    return groups
+
+
+def _tag_pose(fix: TagFix, tag_id: int, family: str, size_m: float, visit: str | None) -> TagPose:
+    return TagPose(
+        tag_id,
+        family,
+        size_m,
+        fix.ref_from_tag,
+        fix.covariance,
+        sum(fix.used),
+        fix.rms_px,
+        visit=visit,
+        verdict=_verdict(fix),
+    )
+
+
+def _verdict(fix: TagFix) -> Literal["pass", "warn", "fail"]:
+    """Judge a tag: fail where no two photos agree; warn where a reader should look at the photos."""
+    used, count = sum(fix.used), len(fix.used)
+    if used == 1 and count > 1:
+        return "fail"
+    sigma = np.sqrt(np.diag(fix.covariance))
+    doubtful = used < 3 or 3 * (count - used) > count or not fix.is_certain
+    if doubtful or float(sigma[3:].max()) > WARN_SIGMA_M or float(sigma[:3].max()) > WARN_SIGMA_RAD:
+        return "warn"
+    return "pass"
+
+
+def _photo_verdict(located: _Located, fix: TagFix, index: int, visit: str | None) -> TagPhoto:
+    sigma = fix.sigmas[index]
+    return TagPhoto(
+        located.photo.file,
+        located.sighting.detection.id,
+        used=fix.used[index],
+        reason="" if fix.used[index] else f"disagrees with the others by {sigma:.1f} sigma",
+        visit=visit,
+        ambiguity=fix.ambiguities[index],
+        sigma=sigma,
+    )
+
+
+def _warn(tags: Sequence[TagPose], photos: Sequence[TagPhoto]) -> None:
+    for tag in tags:
+        where = "" if tag.visit is None else f" of visit {tag.visit}"
+        if tag.verdict != "pass":
+            log.warning("tag %d%s: %s (%d photos used)", tag.id, where, tag.verdict, tag.n_photos)
+    known = {t.id for t in tags}
+    for tag_id in sorted({p.tag_id for p in photos if p.tag_id >= 0} - known):
+        reasons = sorted({p.reason for p in photos if p.tag_id == tag_id})
+        log.warning("tag %d: no pose: %s", tag_id, "; ".join(reasons))
