@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from sim_bridge.errors import SynthesisError
 from sim_bridge.scene import Scene
@@ -31,6 +32,13 @@ class FloorGraph:
     def nearest(self, xy: ArrayLike) -> int:
         """Return the index of the free cell nearest to a point (2,)."""
         return int(np.argmin(np.linalg.norm(self.centres - np.asarray(xy, dtype=np.float64), axis=1)))
+
+    def connects(self, points_xy: Sequence[ArrayLike]) -> bool:
+        """Return whether points (2,) lie on free floor, give or take a cell, and ways lead from the first to all."""
+        nodes = [self.nearest(xy) for xy in points_xy]
+        off = np.linalg.norm(self.centres[nodes] - np.asarray(points_xy, dtype=np.float64), axis=1)
+        _, component = connected_components(self.steps, directed=False)
+        return bool(off.max() < 1.5 * CELL_M and (component[nodes] == component[nodes[0]]).all())
 
 
 def floor_graph(scene: Scene, radius_m: float) -> FloorGraph:

@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from fieldkit.bags.writing import BagFormat
 from fieldkit.errors import suggestion
-from fieldkit.store import atomic_folder, write_rig, write_tum
-from sim_bridge import mapper
+from fieldkit.store import (
+    PhotoEntry,
+    SessionFile,
+    atomic_folder,
+    write_camera,
+    write_photos,
+    write_rig,
+    write_session,
+    write_tags,
+    write_tum,
+)
+from fieldkit.store.files import refuse_existing
+from fieldkit.types import TagMap, TagPose
+from sim_bridge import mapper, photographer, recorder, schedule, staging
 from sim_bridge.errors import SynthesisError
 from sim_bridge.scene import SCENES, Scene
 
@@ -20,20 +34,43 @@ class SessionOptions:
     """What a session is made of."""
 
     walk: mapper.WalkOptions = mapper.WalkOptions()
+    stage: staging.StageOptions = staging.StageOptions()
+    photos: photographer.PhotoOptions = photographer.PhotoOptions()
+    schedule: schedule.ScheduleOptions = schedule.ScheduleOptions()
+    recorder: recorder.RecorderOptions = recorder.RecorderOptions()
 
 
-def synthesize(scene: str, out: Path, *, seed: int = 0, options: SessionOptions | None = None, force: bool = False) -> None:
+def synthesize(
+    scene: str,
+    out: Path,
+    *,
+    seed: int = 0,
+    formats: Sequence[BagFormat] = ("mcap",),
+    options: SessionOptions | None = None,
+    force: bool = False,
+) -> None:
     """Write a session folder; the same scene, seed and options give the same bytes.
 
-    Raises SynthesisError for an unknown scene and StoreError when the folder exists and ``force`` is not set.
+    The recordings of all formats hold the same images, bit for bit. Raises SynthesisError for an unknown scene or
+    format, or a scene without room for the session, and StoreError when the folder exists and ``force`` is not set.
     """
-    chosen = options or SessionOptions()
+    chosen, out = options or SessionOptions(), Path(out)
     if scene not in SCENES:
         raise SynthesisError(f"unknown scene {scene!r}", hint=suggestion(scene, list(SCENES)))
-    with atomic_folder(Path(out), force=force) as folder:
-        room = SCENES[scene](seed)
+    for name in formats or ("",):
+        if name not in recorder.RECORDINGS:
+            raise SynthesisError(f"unknown format {name!r}", hint=suggestion(name, list(recorder.RECORDINGS)))
+    refuse_existing(out, force=force)
+    room = SCENES[scene](seed)
+    stage = staging.set_stage(room, chosen.stage, rng=generator(seed, 4))
+    with atomic_folder(out, force=force) as folder:
         _write_mapping(folder, room, chosen.walk, seed=seed)
+        _write_photos(folder, stage, chosen.photos, seed=seed)
+        _write_robot(folder, stage, chosen, formats, seed=seed)
         _write_surface(folder / "truth" / "surface.ply", room)
+        _write_tags(folder / "truth" / "tags.toml", stage)
+        name = recorder.RECORDINGS[formats[0]]
+        write_session(folder / "session.toml", SessionFile(f"{scene}-{seed}", name, layout="generic"))
 
 
 def generator(seed: int, part: int) -> np.random.Generator:
@@ -53,6 +90,37 @@ def _write_mapping(folder: Path, scene: Scene, options: mapper.WalkOptions, *, s
     for name, data in mapper.depths(scene, stations, options, rng=generator(seed, 3)):
         _write(mapping / "depth" / name, data)
     write_tum(folder / "truth" / "mapping_poses.txt", truth)
+
+
+def _write_photos(folder: Path, stage: staging.Stage, options: photographer.PhotoOptions, *, seed: int) -> None:
+    planned = photographer.plan_photos(stage, options, rng=generator(seed, 5))
+    write_camera(folder / "photos" / photographer.CAMERA_FILE, photographer.camera(options))
+    entries = [PhotoEntry(p.file, photographer.CAMERA_FILE, p.tag.visit) for p in planned]
+    write_photos(folder / "photos" / "photos.toml", entries)
+    for photo, data in photographer.photos(stage.scene, planned, options, rng=generator(seed, 6)):
+        _write(folder / "photos" / photo.file, data)
+    write_tum(folder / "truth" / "photo_poses.txt", [(p.file, p.world_from_cam) for p in planned])
+
+
+def _write_robot(
+    folder: Path, stage: staging.Stage, options: SessionOptions, formats: Sequence[BagFormat], *, seed: int
+) -> None:
+    plan = schedule.plan_session(stage, options.schedule, stage_options=options.stage, rng=generator(seed, 7))
+    sensed = recorder.sense(stage, plan, options.recorder, rng=generator(seed, 8))
+    for name in dict.fromkeys(formats):
+        recorder.write_recording(folder / recorder.RECORDINGS[name], sensed, format=name)
+    truth = folder / "truth"
+    write_tum(truth / "body_poses.txt", [(str(t_ns), pose) for t_ns, pose in sensed.world_from_body])
+    write_tum(truth / "view_poses.txt", [(str(image.t_ns), image.world_from_cam) for image in sensed.images])
+
+
+def _write_tags(path: Path, stage: staging.Stage) -> None:
+    exact = np.zeros((6, 6))
+    tags = tuple(
+        TagPose(tag.id, staging.FAMILY, tag.size_m, tag.world_from_tag, exact, 0, 0.0, visit=tag.visit)
+        for tag in stage.tags
+    )
+    write_tags(path, TagMap(tags, (), "world"))
 
 
 def _write_surface(path: Path, scene: Scene) -> None:

@@ -1,0 +1,124 @@
+"""Photos of the tags and their surroundings, taken by a person with a good camera, as the field guide asks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.cameras import Camera
+from fieldkit.frames import Pose
+from sim_bridge import effects
+from sim_bridge.aim import look_at
+from sim_bridge.errors import SynthesisError
+from sim_bridge.render import render
+from sim_bridge.scene import Scene
+from sim_bridge.staging import PlacedTag, Stage, clear_around, richness, sees, slant
+
+Array = NDArray[np.float64]
+
+# 12 megapixels, 69 deg wide, with the barrel distortion of an ordinary zoom lens.
+PHOTO_CAMERA = Camera("OPENCV", 4000, 3000, (2905.4, 2903.1, 2012.3, 1489.6, -0.105, 0.062, 0.0007, -0.0005))
+CAMERA_FILE = "camera.toml"
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoOptions:
+    """How many photos are taken, and from where."""
+
+    start_photos: int = 8
+    tripod_photos: int = 6
+    distance_m: tuple[float, float] = (0.8, 2.2)
+    height_m: tuple[float, float] = (1.1, 1.7)
+    slant_deg: float = 50.0
+    noise_sigma: float = 1.5
+    jpeg_quality: int = 92
+    scale: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """A photo to take: its file name, the tag it is of, and the camera's pose."""
+
+    file: str
+    tag: PlacedTag
+    world_from_cam: Pose
+
+
+def camera(options: PhotoOptions) -> Camera:
+    """Return the calibrated camera of the photos."""
+    return PHOTO_CAMERA if options.scale == 1.0 else PHOTO_CAMERA.scaled(options.scale)
+
+
+def plan_photos(stage: Stage, options: PhotoOptions, *, rng: np.random.Generator) -> tuple[Photo, ...]:
+    """Choose the viewpoints of all photos; raises SynthesisError where too few places see a tag."""
+    photos = []
+    for tag in stage.tags:
+        name = f"start{tag.id}" if tag.visit is None else tag.visit
+        count = options.start_photos if tag.visit is None else options.tripod_photos
+        poses = _viewpoints(stage.scene, tag, count, options, rng=rng)
+        photos += [Photo(f"{name}_{k + 1:02d}.jpg", tag, pose) for k, pose in enumerate(poses)]
+    return tuple(photos)
+
+
+def photos(
+    scene: Scene, planned: tuple[Photo, ...], options: PhotoOptions, *, rng: np.random.Generator
+) -> Iterator[tuple[Photo, bytes]]:
+    """Render the photos: yield each with its JPEG file."""
+    for photo in planned:
+        image = render(scene, camera(options), photo.world_from_cam).rgb
+        noisy = effects.add_noise(image, sigma=options.noise_sigma, rng=rng)
+        yield photo, effects.jpeg(noisy, quality=options.jpeg_quality)
+
+
+def _viewpoints(
+    scene: Scene, tag: PlacedTag, count: int, options: PhotoOptions, *, rng: np.random.Generator
+) -> list[Pose]:
+    """Choose viewpoints from left to right of a tag; in each sector the one that shows most of the surroundings."""
+    edges = np.linspace(-options.slant_deg, options.slant_deg, count + 1)
+    sectors: list[list[Pose]] = []
+    for low, high in zip(edges, edges[1:], strict=False):
+        found = [_try(scene, tag, (low, high), options, rng=rng) for _ in range(40)]
+        ranked = sorted(
+            (pose for pose in found if pose is not None), key=lambda pose: -richness(scene, pose)
+        )
+        sectors.append(ranked)
+    chosen = [sector[0] for sector in sectors if sector]
+    # A sector that furniture blocks leaves its photo to the others.
+    for rank in range(1, 40):
+        for sector in sectors:
+            if len(chosen) < count and rank < len(sector):
+                chosen.append(sector[rank])
+    if len(chosen) < count:
+        raise SynthesisError(
+            f"only {len(chosen)} places from which tag {tag.id} can be photographed; expected {count}",
+            hint="use another seed",
+        )
+    return chosen
+
+
+def _try(
+    scene: Scene, tag: PlacedTag, sector_deg: tuple[float, float], options: PhotoOptions, *, rng: np.random.Generator
+) -> Pose | None:
+    """Propose a viewpoint in a sector, the tag somewhere in the picture; None when it does not work."""
+    angle, distance = np.radians(rng.uniform(*sector_deg)), rng.uniform(*options.distance_m)
+    height, roll = rng.uniform(*options.height_m), np.radians(rng.normal(0.0, 3.0))
+    aside, up = rng.uniform(-0.35, 0.35) * distance, rng.uniform(-0.05, 0.3) * distance
+    rise = height - tag.world_from_tag.translation[2]
+    flat = np.sqrt(max(distance**2 - rise**2, 0.0))
+    if flat < 0.4:
+        return None
+    normal = tag.world_from_tag.rotation.apply([0.0, 0.0, 1.0])
+    yaw = np.arctan2(normal[1], normal[0]) + angle
+    at = tag.world_from_tag.translation + [flat * np.cos(yaw), flat * np.sin(yaw), rise]
+    if not scene.free_floor(at[:2], 0.2)[0]:
+        return None
+    across = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    pose = look_at(at, tag.world_from_tag.translation + aside * across + [0.0, 0.0, up], roll_rad=float(roll))
+    taken = camera(options)
+    margin = 0.06 * taken.height
+    if slant(pose, tag) > np.radians(options.slant_deg + 8.0) or not sees(scene, pose, taken, tag, margin_px=margin):
+        return None
+    return pose if clear_around(scene, pose.translation, radius_m=0.2) else None
