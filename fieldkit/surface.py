@@ -159,6 +159,20 @@ def _mesh(distance: NDArray[np.float32], weight: NDArray[np.float32], low: Array
     return Surface(low + voxel_m * vertices.astype(np.float64), faces.astype(np.int32), voxel_m)
 
 
+def coarsen(surface: Surface, *, voxel_m: float) -> Surface:
+    """Merge all vertices inside each cell of a grid of ``voxel_m`` into their mean, and drop triangles that vanish."""
+    cells = np.floor(surface.vertices / voxel_m).astype(np.int64)
+    _, owner = np.unique(cells, axis=0, return_inverse=True)
+    owner = owner.ravel()
+    count = np.bincount(owner).astype(np.float64)
+    vertices = np.stack([np.bincount(owner, weights=surface.vertices[:, k]) / count for k in range(3)], axis=1)
+    faces = owner[surface.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Surface(vertices, faces[np.sort(first)].astype(np.int32), max(voxel_m, surface.voxel_m))
+
+
 def write_ply(path: Path, surface: Surface) -> None:
     """Write a binary PLY (float32 vertices, int32 triangles)."""
     header = (

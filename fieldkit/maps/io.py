@@ -63,7 +63,7 @@ def write_features(path: Path, features: Mapping[str, Features], sizes: Mapping[
     """Write features.h5 in hloc's layout: per image name keypoints (n, 2) without COLMAP's half pixel,
     descriptors (w, n), scores (n,) and image_size (2,) = width, height."""
     options: dict[str, Any] = {"compression": "gzip", "compression_opts": 9, "shuffle": True} if compress else {}
-    with h5py.File(path, "w", track_order=False) as file:
+    with h5py.File(path, "w", libver="v110") as file:
         for name in sorted(features):
             found = features[name]
             group = file.create_group(name)

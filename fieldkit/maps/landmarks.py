@@ -71,6 +71,43 @@ def model_arrays(model: pycolmap.Reconstruction) -> Model:
     )
 
 
+def model_from_arrays(model: Model, pixels: Sequence[NDArray[np.float32]]) -> pycolmap.Reconstruction:
+    """Make a COLMAP model of arrays; ``pixels`` f32[m, 2] are all keypoints of each image, in COLMAP pixels."""
+    result = pycolmap.Reconstruction()
+    camera_ids: dict[Camera, int] = {}
+    for i, (name, camera, pose) in enumerate(
+        zip(model.image_names, model.image_cameras, model.map_from_image, strict=True), start=1
+    ):
+        if camera not in camera_ids:
+            camera_ids[camera] = len(camera_ids) + 1
+            result.add_camera_with_trivial_rig(colmap_camera(camera, camera_ids[camera]))
+        points = pycolmap.Point2DList([pycolmap.Point2D(xy.astype(np.float64)) for xy in pixels[i - 1]])
+        image = pycolmap.Image(name=name, camera_id=camera_ids[camera], image_id=i, points2D=points)
+        matrix = pose.inv().as_matrix()
+        result.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix[:3]))
+    order = np.argsort(model.observation_landmark, kind="stable")
+    bounds = np.searchsorted(model.observation_landmark[order], np.arange(len(model.xyz) + 1))
+    for k, xyz in enumerate(model.xyz):
+        track = pycolmap.Track()
+        for o in order[bounds[k] : bounds[k + 1]]:
+            track.add_element(int(model.observation_image[o]) + 1, int(model.observation_keypoint[o]))
+        result.add_point3D(xyz, track)
+    result.update_point_3d_errors()
+    return result
+
+
+def colmap_camera(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
+    """Return COLMAP's camera with the same model, size and parameters."""
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+        has_prior_focal_length=True,
+    )
+
+
 def _camera(camera: pycolmap.Camera) -> Camera:
     return Camera(camera.model_name, camera.width, camera.height, tuple(float(v) for v in camera.params))
 

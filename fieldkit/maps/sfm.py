@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
 from fieldkit.features import Features
+from fieldkit.maps.landmarks import colmap_camera
 from fieldkit.maps.pairs import Pair
 from fieldkit.maps.source import SourceImage
 
@@ -31,18 +32,6 @@ def quiet_colmap() -> Iterator[None]:
         yield
     finally:
         pycolmap.logging.minloglevel = before
-
-
-def colmap_camera(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
-    """Return COLMAP's camera with the same model, size and parameters."""
-    return pycolmap.Camera(
-        camera_id=camera_id,
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
-        has_prior_focal_length=True,
-    )
 
 
 def write_database(
