@@ -14,13 +14,12 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from tyro.conf import Positional
+from tyro.conf import UseAppendAction as Repeated
 
 from fieldkit.errors import FieldkitError
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
-
-Positional = tyro.conf.Positional
-Repeated = tyro.conf.UseAppendAction
 
 
 def inspect(recording: Positional[Path], *, layout: str | None = None, json: bool = False) -> None:

@@ -7,6 +7,7 @@ from fieldkit.store.files import (
     plain_json,
     read_json,
     read_toml,
+    refuse_existing,
     write_toml,
 )
 from fieldkit.store.inputs import (
