@@ -128,6 +128,8 @@ def _judge_tags(tags: TagMap, truth: Path, gauge: Gauge) -> list[dict[str, Any]]
     result = []
     for tag in tags.tags:
         known = true.find(tag.id, visit=tag.visit)
+        if known is None and any(t.id == tag.id for t in true.tags):
+            continue  # another visit's tag, seen in passing: the truth does not say where it stood then
         if known is None:
             raise JudgeError(f"{truth / 'tags.toml'}: has no tag {tag.id}", hint="judge with the session's own tags")
         estimate = gauge.world_from_map * tag.map_from_tag
