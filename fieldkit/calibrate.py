@@ -27,6 +27,9 @@ log = logging.getLogger(__name__)
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 # A photo's covariance says how well its matches fit, not how far their landmarks are off together: it may be scaled up
 PHOTO_SCALES = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
+# Photos are localized at this multiple of the mapping images' focal length in pixels: the many keypoints of finer
+# texture, which mapping could not see, find no match and crowd out those that do
+FOCAL_RATIO = 1.5
 # A tag known worse than this, 1 sigma per axis, deserves a warning
 WARN_SIGMA_M, WARN_SIGMA_RAD = 0.01, math.radians(0.5)
 
@@ -212,6 +215,7 @@ def _localize(
     shots: Sequence[_Shot], scene_map: SceneMap, rules: LocalizerRules | None, progress: Progress | None
 ) -> tuple[list[_Located], list[TagPhoto]]:
     localizer = Localizer(scene_map, rules or LocalizerRules())
+    finest_px = FOCAL_RATIO * float(np.median([c.focal_px[0] for c in scene_map.image_cameras]))
     located: list[_Located] = []
     failed: list[TagPhoto] = []
     for number, shot in enumerate(shots):
@@ -219,7 +223,7 @@ def _localize(
             progress("localize photos", number, len(shots))
         image = _read_photo(shot.photo)
         assert image is not None
-        estimate: Estimate = localizer.localize(image, shot.photo.camera)
+        estimate: Estimate = localizer.localize(*_reduced(image, shot.photo.camera, finest_px))
         for d in shot.detections:
             if estimate.map_from_cam is None or estimate.covariance is None:
                 reason = f"not localized ({estimate.status}, {estimate.n_inliers} inliers)"
@@ -228,6 +232,16 @@ def _localize(
                 sighting = Sighting(d, shot.photo.camera, estimate.map_from_cam, estimate.covariance)
                 located.append(_Located(shot.photo, sighting))
     return located, failed
+
+
+def _reduced(image: Image, camera: Camera, focal_px: float) -> tuple[Image, Camera]:
+    """Return image and camera, made smaller where the focal length is longer than ``focal_px``."""
+    factor = focal_px / camera.focal_px[0]
+    if factor >= 1.0:
+        return image, camera
+    small = camera.scaled(factor)
+    resized = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(resized, dtype=np.uint8), small
 
 
 def _groups(located: Sequence[_Located]) -> dict[tuple[int, str, str | None], list[_Located]]:
