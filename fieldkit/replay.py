@@ -79,7 +79,7 @@ def replay(
     after a kill resumes. Raises FieldkitError where map, tags, recordings and protocol do not fit together; a visit
     without prior or truth is excluded with its reason.
     """
-    store.refuse_existing(Path(out), force=force)
+    store.refuse_existing(Path(out), force=force, marker="run.json")
     for name in protocol.policies:
         if name not in policies.NOT_RANKED:
             policies.available(name)

@@ -95,6 +95,19 @@ def test_a_run_is_never_overwritten_without_force(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
+def test_force_never_replaces_a_folder_of_something_else(tmp_path: Path) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.txt").write_text("three years of work")
+    with pytest.raises(StoreError, match=r"thesis: holds no run\.json, so --force does not replace it"):
+        store.write_run(tmp_path / "thesis", make_run(), force=True)
+    assert (tmp_path / "thesis" / "chapter1.txt").exists()
+
+
+def test_a_file_cannot_replace_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="is a folder; expected a file"):
+        store.atomic_write(tmp_path, "text")
+
+
 def test_a_folder_that_fails_half_way_leaves_the_old_one(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old.txt").write_text("old")

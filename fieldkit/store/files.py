@@ -40,25 +40,28 @@ def atomic_write(path: Path, data: bytes | str) -> None:
             os.fsync(stream.fileno())
         os.chmod(name, 0o644)
         os.replace(name, path)
+    except IsADirectoryError as error:
+        Path(name).unlink(missing_ok=True)
+        raise StoreError(f"{path}: is a folder; expected a file", hint="choose another --out") from error
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
 
 
 @contextlib.contextmanager
-def atomic_folder(path: Path, *, force: bool = False) -> Iterator[Path]:
+def atomic_folder(path: Path, *, force: bool = False, marker: str | None = None) -> Iterator[Path]:
     """Yield an empty folder beside ``path`` that takes its place on success and vanishes on failure.
 
-    Raises StoreError when ``path`` exists and ``force`` is not set; it is asked again before the folder is replaced.
+    Raises StoreError as `refuse_existing` does, which is asked again before the folder is replaced.
     """
     path = Path(path)
-    refuse_existing(path, force=force)
+    refuse_existing(path, force=force, marker=marker)
     path.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
         yield work
         work.chmod(0o755)
-        refuse_existing(path, force=force)
+        refuse_existing(path, force=force, marker=marker)
         _replace(work, path)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -80,13 +83,21 @@ def _replace(work: Path, path: Path) -> None:
         shutil.rmtree(old.parent, ignore_errors=True)
 
 
-def refuse_existing(path: Path, *, force: bool) -> None:
-    """Raise StoreError when something stands at ``path`` and may not be replaced."""
+def refuse_existing(path: Path, *, force: bool, marker: str | None = None) -> None:
+    """Raise StoreError when something stands at ``path`` and may not be replaced.
+
+    An empty folder may be. With ``force`` anything may be that holds the file ``marker``, by which a folder of the
+    same kind is known: a mistyped --out never wipes a folder of something else.
+    """
     path = Path(path)
-    if path.is_dir() and not any(path.iterdir()):
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
-    if path.exists() and not force:
+    if not force:
         raise StoreError(f"{path}: exists already", hint="give --force to replace it, or choose another --out")
+    if marker is not None and not (path / marker).is_file():
+        raise StoreError(
+            f"{path}: holds no {marker}, so --force does not replace it", hint="remove it, or choose another --out"
+        )
 
 
 def digest(*parts: bytes | str | Path) -> str:

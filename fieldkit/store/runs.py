@@ -80,7 +80,7 @@ class _RunFile(msgspec.Struct, forbid_unknown_fields=True):
 
 def write_run(path: Path, run: Run, *, force: bool = False) -> None:
     """Write a run folder (run.json and tables); raises StoreError when it exists and ``force`` is not set."""
-    with atomic_folder(Path(path), force=force) as folder:
+    with atomic_folder(Path(path), force=force, marker="run.json") as folder:
         head = _RunFile(
             1, protocols.to_dict(run.protocol), run.map_digest, run.tags_digest, list(run.recordings), run.seed,
             dict(run.versions), list(run.sessions), list(run.excluded),
