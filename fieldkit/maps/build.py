@@ -21,6 +21,7 @@ from fieldkit.maps.io import AlignmentEntry, MapFile, SurfaceEntry, content_dige
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
 from fieldkit.maps.pairs import choose_pairs, match_pairs
 from fieldkit.maps.sfm import reconstruct, threads
+from fieldkit.maps.rigs import contradicting
 from fieldkit.maps.source import DepthFrame, MapSource, read_source
 from fieldkit.store import atomic_folder
 from fieldkit.store.files import refuse_existing
@@ -110,6 +111,10 @@ def build_map(
     sfm_poses = _registered(walk, model, options)
     alignment, warnings = _align(walk, sfm_poses, seed)
     mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
+    for i in contradicting(walk.images, mapped):
+        warnings.append(f"{walk.images[i].name} left out: its pose contradicts the rig")
+        model.deregister_frame(i + 1)
+        del mapped[i]
     n_landmarks = _finish_model(walk, model, alignment.map_from_sfm, options.landmarks)
     clock.lap("align")
     surface, missing = _surface(walk, mapped, options, tell)

@@ -15,7 +15,10 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".bmp")
 
 @dataclasses.dataclass(frozen=True)
 class SourceImage:
-    """One mapping image: name below images/, file, camera, sequence (one camera's walk), frame, and SLAM pose."""
+    """One mapping image: name below images/, file, camera, sequence (one camera's walk), frame, and SLAM pose.
+
+    ``rig_from_cam`` is known for a rig's images; those with the same ``frame`` were taken at the same time.
+    """
 
     name: str
     file: Path
@@ -23,6 +26,7 @@ class SourceImage:
     sequence: str
     frame: str
     slam_from_cam: Pose | None
+    rig_from_cam: Pose | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +89,9 @@ def _read_rig_folder(path: Path) -> MapSource:
                 cam_from_depth = camera.rig_from_cam.inv() * rig.depth.rig_from_cam
                 frames.setdefault(file.stem, []).append((len(images), cam_from_depth))
             name = f"{camera.name}/{file.name}"
-            images.append(SourceImage(name, file, camera.camera, camera.name, file.stem, slam_from_cam))
+            images.append(
+                SourceImage(name, file, camera.camera, camera.name, file.stem, slam_from_cam, camera.rig_from_cam)
+            )
     depth = tuple(
         DepthFrame(path / "depth" / f"{frame}.png", tuple(anchors))
         for frame, anchors in sorted(frames.items())
