@@ -68,14 +68,37 @@ def calibrate_tags(
     rules: LocalizerRules | None = None,
     progress: Progress | None = None,
 ) -> TagMap:
+    """Find map_from_tag of every tag in a folder of photos, in the map in a folder; see `calibrate_photos`.
+
+    Raises also MapError, before any photo is read.
+    """
+    scene_map = load_map(Path(map_path))
+    return calibrate_photos(
+        photos, scene_map, camera=camera, sizes_m=sizes_m, families=families, rules=rules, progress=progress
+    )
+
+
+def calibrate_photos(
+    photos: Path,
+    scene_map: SceneMap,
+    *,
+    camera: Path | None = None,
+    sizes_m: Mapping[int | None, float],
+    families: Sequence[str] = ("tag36h11",),
+    rules: LocalizerRules | None = None,
+    progress: Progress | None = None,
+) -> TagMap:
     """Find map_from_tag of every tag in a folder of photos, with covariance and a verdict on every photo.
+
+    Every photo is localized in the map; photos and tags are then one least-squares problem per tag. The covariance
+    has the noise of corners and of localization, scaled to what the photos show; a warp or wrong scale of the map,
+    which all photos share, and an error of the tag's size are not in it.
 
     The folder holds photos.toml, or photos of one camera (``camera``, else camera.toml in the folder). ``sizes_m`` as
     `parse_sizes` returns it. A tag whose photos all name a visit gets one pose per visit; one that is also in photos
     without a visit is fixed, and all its photos count. Raises TagError, StoreError or LocalizeError.
     """
     listed = _list_photos(Path(photos), camera)
-    scene_map = load_map(Path(map_path))
     shots, rejected = _find_tags(Path(photos), listed, sizes_m, families, progress)
     located, failed = _localize(shots, scene_map, rules, progress)
     rejected += failed
@@ -89,7 +112,7 @@ def calibrate_tags(
     if not tags:
         reasons = sorted({f"{p.file}: {p.reason}" for p in rejected})
         raise TagError(
-            f"{photos}: no photo of a tag could be localized in {map_path} ({reasons[0]}); expected at least one",
+            f"{photos}: no photo of a tag could be localized in {scene_map.path} ({reasons[0]}); expected at least one",
             hint="take photos that show the tag and much of its mapped surroundings",
         )
     _warn(tags, verdicts + rejected)

@@ -12,7 +12,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
 from fieldkit.frames import Pose, compose_covariance, exp
 from fieldkit.tags.detect import TagDetection
-from fieldkit.tags.pose import TagSolution, project_derivative, solve, tag_corners
+from fieldkit.tags.pose import TagSolution, project_derivative, solve, tag_corners, tilt_is_known
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -60,8 +60,8 @@ class TagFix:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the sightings decide between the two solutions."""
-        return self.evidence > CERTAIN
+        """Whether the sightings decide between the two solutions, and these have not merged into one."""
+        return self.evidence > CERTAIN and tilt_is_known(self.covariance)
 
 
 def fuse_sightings(

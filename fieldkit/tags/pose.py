@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import cv2
 import numpy as np
@@ -15,8 +16,7 @@ from fieldkit.tags.detect import TagDetection
 
 Array = NDArray[np.float64]
 
-# Above this, which of the two solutions is right is in doubt
-SUSPECT_AMBIGUITY = 0.2
+MERGED_SIGMA_RAD = math.radians(3.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +24,8 @@ class TagSolution:
     """A tag's pose in the camera with its 6x6 covariance, and the other solution of the planar problem.
 
     ``ambiguity`` is the residual of the better solution over that of the other one, 0..1: above 0.2 the choice is
-    suspect, at 1 the image cannot tell them apart. Residuals are root mean squares per coordinate, in pixels.
+    suspect, at 1 the image cannot tell them apart. Without another solution it is 0, or 1 where the tilt is so uncertain
+    that both have merged. Residuals are root mean squares per coordinate, in pixels.
     """
 
     cam_from_tag: Pose
@@ -66,7 +67,8 @@ def solve(detection: TagDetection, camera: Camera, size_m: float) -> TagSolution
     rms, best, jacobian = found[0]
     others = [f for f in found[1:] if (best.inv() * f[1]).rotation.magnitude() > 1e-3]
     if not others:
-        return TagSolution(best, _covariance(jacobian, detection.sigma_px), rms, None, None, float("inf"), 0.0)
+        covariance = _covariance(jacobian, detection.sigma_px)
+        return TagSolution(best, covariance, rms, None, None, float("inf"), 0.0 if tilt_is_known(covariance) else 1.0)
     other_rms, other, other_jacobian = others[0]
     return TagSolution(
         best,
@@ -77,6 +79,11 @@ def solve(detection: TagDetection, camera: Camera, size_m: float) -> TagSolution
         other_rms,
         rms / max(other_rms, 1e-12),
     )
+
+
+def tilt_is_known(covariance: Array) -> bool:
+    """Tell whether a pose's rotation is certain enough (3 deg, 1 sigma) for its two solutions not to have merged."""
+    return float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < MERGED_SIGMA_RAD**2
 
 
 def project_tag(cam_from_tag: Pose, points: Array, focal: ArrayLike) -> tuple[Array, Array]:
