@@ -83,7 +83,7 @@ class Camera:
     @property
     def is_pinhole(self) -> bool:
         """Whether the camera has no distortion."""
-        return not any(self.opencv_distortion)
+        return not self.is_fisheye and not any(self.opencv_distortion)
 
     def matrix(self, *, opencv: bool = False) -> Array:
         """Return the 3x3 calibration matrix; with ``opencv`` the centre of the first pixel is (0, 0)."""

@@ -34,6 +34,7 @@ class Quad:
     texture: int
     cell_m: float
     solid: bool
+    closed: bool
     glow: float | None
 
 
@@ -66,12 +67,13 @@ class Builder:
     ) -> None:
         """Add a rectangle of (width, height) centred on a pose, x right, y up, facing +z.
 
-        A panel that is not ``solid`` casts no shadow (a picture on a wall); ``glow`` is a fixed brightness.
+        A panel that is not ``solid`` casts no shadow and is seen from both sides (a picture); ``glow`` is a
+        fixed brightness.
         """
         x, y = size_m[0] / 2, size_m[1] / 2
         corners = world_from_quad.apply(np.array([[-x, y, 0.0], [x, y, 0.0], [x, -y, 0.0], [-x, -y, 0.0]]))
         normal = world_from_quad.rotation.apply([0.0, 0.0, 1.0])
-        self.quads.append(Quad(corners, normal, texture, cell_m, solid, glow))
+        self.quads.append(Quad(corners, normal, texture, cell_m, solid, closed=solid, glow=glow))
 
     def box(
         self,
@@ -97,7 +99,7 @@ class Builder:
         for i in range(6):
             normal = world_from_place.rotation.apply(normals[i])
             here = world_from_place.apply(corners[i])
-            self.quads.append(Quad(here, normal, special.get(i, texture), cell_m, solid, glow=None))
+            self.quads.append(Quad(here, normal, special.get(i, texture), cell_m, solid, closed=True, glow=None))
 
     def block(self, world_from_place: Pose, size_xy: tuple[float, float]) -> None:
         """Mark a footprint of (x, y) in m, centred on a place, as not free."""
@@ -128,6 +130,7 @@ class Builder:
             uv=uv[faces].astype(np.float32),
             texture=np.repeat([q.texture for q in self.quads], counts).astype(np.int32),
             textures=tuple(self.textures),
+            closed=np.repeat([q.closed for q in self.quads], counts),
             shade=np.ones((len(faces), 3), np.float32),
             blocks=np.stack(self.blocks) if self.blocks else np.zeros((0, 8)),
             walk_xy=walk_xy,
@@ -162,9 +165,7 @@ def _grid(quad: Quad) -> _Grid:
     return _Grid(points, np.stack([u, v], axis=1), np.concatenate([upper, lower]))
 
 
-def bake(
-    scene: Scene, points: Array, normals: Array, light: Light, *, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def bake(scene: Scene, points: Array, normals: Array, light: Light, *, rng: np.random.Generator) -> NDArray[np.float64]:
     """Return the brightness f64[n] at surface points: lamps with shadows plus ambient light darkened in corners.
 
     Brightness multiplies gamma-encoded texels: it is the 1/2.2 power of the light.
@@ -202,5 +203,6 @@ def _openness(
         direction = radius[i] * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * along)
         direction += np.sqrt(1.0 - radius[i] ** 2) * normals
         distance = scene.intersect(points, direction)
-        total += np.minimum(distance / light.occlusion_reach_m, 1.0)
+        # A ray that grazes a face may come out with no distance or one a rounding below zero.
+        total += np.fmax(np.fmin(distance / light.occlusion_reach_m, 1.0), 0.0)
     return total / light.rays

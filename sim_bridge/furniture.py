@@ -38,7 +38,8 @@ def cupboard(build: Builder, rng: np.random.Generator, place: Pose, *, width_m: 
     build.box(place, [0.0, depth / 2, height_m / 2], [width_m, depth, height_m], side, front=front)
     build.block(place * yaw_pose([0.0, depth / 2, 0.0], 0.0), (width_m, depth))
     if height_m < 1.0:
-        _carton(build, rng, place * yaw_pose([rng.uniform(-0.25, 0.25), 0.22, height_m], rng.normal(0, 0.2)), 0.26)
+        at = place * yaw_pose([rng.uniform(-0.25, 0.25), 0.02, height_m], 0.0)
+        _carton(build, rng, at, 0.26, turn_rad=float(rng.uniform(-0.1, 0.1)))
         return height_m + 0.3
     return height_m
 
@@ -72,7 +73,13 @@ def _shelf(build: Builder, rng: np.random.Generator, place: Pose, *, width_m: fl
         z = 0.06 + i * step
         build.box(place, [0.0, 0.006, z], [width_m - 2 * board, depth - 0.014, board], wood)
         if i < rows:
-            _books(build, rng, place * yaw_pose([0.0, 0.0, z + board / 2], 0.0), width_m - 2 * board, step - board)
+            _books(
+                build,
+                rng,
+                place * yaw_pose([0.0, 0.0, z + board / 2], 0.0),
+                width_m - 2 * board,
+                step - board,
+            )
     build.block(place, (width_m, depth))
 
 
@@ -83,7 +90,8 @@ def _books(build: Builder, rng: np.random.Generator, place: Pose, width_m: float
             x += float(rng.uniform(0.08, 0.3))
             continue
         if rng.random() < 0.12 and x < stop - 0.34:
-            _carton(build, rng, place * yaw_pose([x + 0.15, 0.02, 0.0], rng.normal(0, 0.03)), 0.24, width_m=0.28)
+            at = place * yaw_pose([x + 0.155, -0.11, 0.0], 0.0)
+            _carton(build, rng, at, 0.24, width_m=0.28, turn_rad=float(rng.uniform(-0.03, 0.03)))
             x += 0.31
             continue
         thick = float(rng.uniform(0.025, 0.07))
@@ -97,42 +105,51 @@ def _books(build: Builder, rng: np.random.Generator, place: Pose, width_m: float
 
 
 def _carton(
-    build: Builder, rng: np.random.Generator, place: Pose, height_m: float, *, width_m: float | None = None
+    build: Builder,
+    rng: np.random.Generator,
+    place: Pose,
+    height_m: float,
+    *,
+    width_m: float | None = None,
+    turn_rad: float = 0.0,
+    on: str = "furniture",
 ) -> float:
-    """Add a carton that stands on a place."""
+    """Add a carton, turned, whose hindmost corner is at y = 0 of a place; on the ``floor`` it marks its footprint."""
     width = float(rng.uniform(0.3, 0.5)) if width_m is None else width_m
     depth = float(rng.uniform(0.28, 0.4)) if width_m is None else 0.24
+    back = (abs(np.sin(turn_rad)) * width + np.cos(turn_rad) * depth) / 2 + 0.002
+    at = place * yaw_pose([0.0, back, 0.0], turn_rad)
     sides = {
         i: build.texture(textures.cardboard(rng, (int(height_m * 600), int(side * 600))))
         for i, side in ((0, depth), (1, depth), (2, width), (3, width))
     }
     top = build.texture(textures.cardboard(rng, (int(depth * 400), int(width * 400))))
-    build.box(place, [0.0, 0.0, height_m / 2], [width, depth, height_m], top, sides=sides)
+    build.box(at, [0.0, 0.0, height_m / 2], [width, depth, height_m], top, sides=sides)
+    if on == "floor":
+        build.block(at, (width, depth))
     return height_m
+
+
+def _stack(build: Builder, rng: np.random.Generator, place: Pose, *, turn_rad: float) -> float:
+    """Pile up to three cartons and return the height."""
+    z = 0.0
+    for _ in range(int(rng.integers(1, 4))):
+        at = place * yaw_pose([rng.normal(0, 0.015), 0.0, z], 0.0)
+        turn = float(np.clip(rng.normal(0, turn_rad), -0.25, 0.25))
+        z += _carton(build, rng, at, float(rng.uniform(0.25, 0.4)), turn_rad=turn, on="floor")
+    return z
 
 
 def cartons(build: Builder, rng: np.random.Generator, place: Pose, *, width_m: float) -> float:
     """Add two stacks of cartons against a wall."""
-    highest = 0.0
-    for side in (-1, 1):
-        z = 0.0
-        for _ in range(int(rng.integers(1, 4))):
-            at = place * yaw_pose([side * width_m / 4 + rng.normal(0, 0.015), 0.26, z], rng.normal(0, 0.06))
-            z += _carton(build, rng, at, float(rng.uniform(0.25, 0.4)))
-        highest = max(highest, z)
-    build.block(place * yaw_pose([0.0, 0.27, 0.0], 0.0), (width_m, 0.5))
-    return highest
+    sides = (-width_m / 4, width_m / 4)
+    return max(_stack(build, rng, place * yaw_pose([x, 0.0, 0.0], 0.0), turn_rad=0.06) for x in sides)
 
 
 def pile(build: Builder, rng: np.random.Generator, place: Pose) -> float:
     """Add stacks of cartons in the open, and a low cupboard beside them."""
-    highest = 0.0
-    for x, y in ((-0.8, -0.2), (-0.25, 0.18), (-0.3, -0.3), (-0.82, 0.3)):
-        z = 0.0
-        for _ in range(int(rng.integers(1, 4))):
-            z += _carton(build, rng, place * yaw_pose([x, y, z], rng.normal(0, 0.12)), float(rng.uniform(0.26, 0.4)))
-        highest = max(highest, z)
-    build.block(place * yaw_pose([-0.55, 0.0, 0.0], 0.0), (1.1, 1.06))
+    spots = ((-0.83, -0.5), (-0.32, -0.48), (-0.83, -0.02), (-0.32, 0.0))
+    highest = max(_stack(build, rng, place * yaw_pose([x, y, 0.0], 0.0), turn_rad=0.1) for x, y in spots)
     cupboard(build, rng, place * yaw_pose([0.62, -0.3, 0.0], 0.0), width_m=0.85, height_m=0.95)
     return highest
 
@@ -189,12 +206,18 @@ def _monitor(build: Builder, rng: np.random.Generator, place: Pose) -> None:
 
 
 def _litter(
-    build: Builder, rng: np.random.Generator, place: Pose, size: tuple[float, float], *, height_m: float, count: int
+    build: Builder,
+    rng: np.random.Generator,
+    place: Pose,
+    size: tuple[float, float],
+    *,
+    height_m: float,
+    count: int,
 ) -> None:
     """Strew papers, books and mugs over a table top."""
     for i in range(count):
-        x, y = rng.uniform(-0.42, 0.42) * size[0], rng.uniform(-0.35, 0.38) * size[1]
-        at = place * yaw_pose([x, y, height_m + 0.0015 * (i + 1)], rng.uniform(-np.pi, np.pi))
+        x, y = rng.uniform(-0.5, 0.5, 2) * (np.asarray(size) - 0.38)
+        at = place * yaw_pose([x, y, height_m + 0.0005 * (i + 1)], rng.uniform(-np.pi, np.pi))
         kind = rng.random()
         if kind < 0.5:
             build.panel(at, (0.21, 0.297), build.texture(textures.page(rng, (300, 212))), solid=False)

@@ -45,7 +45,7 @@ def _row_map(nodes: NDArray, step: int, y: int) -> NDArray:
 @njit(cache=True)
 def _depth_at(x: float, y: float, seen: NDArray, planes: NDArray) -> float:
     """Return the exact depth at a pinhole pixel position: the nearest triangle there of those seen around it."""
-    col, row = int(math.floor(x - 0.5)), int(math.floor(y - 0.5))
+    col, row = math.floor(x - 0.5), math.floor(y - 0.5)
     best = 0.0
     for dy in range(2):
         for dx in range(2):
@@ -86,7 +86,7 @@ def bend(
             v = w[0] * line[first, 1] + w[1] * line[first + 1, 1] + w[2] * line[first + 2, 1]
             u += w[3] * line[first + 3, 0]
             v += w[3] * line[first + 3, 1]
-            col, row = int(math.floor(u - 0.5)), int(math.floor(v - 0.5))
+            col, row = math.floor(u - 0.5), math.floor(v - 0.5)
             wx, wy = _keys(u - 0.5 - col), _keys(v - 0.5 - row)
             red = green = blue = 0.0
             for j in range(4):

@@ -26,7 +26,7 @@ MIN_TEXTURE_PX = 1024
 class Mips:
     """Mip chains of all textures: ``texels`` uint32 packed as blue-green-red, ``levels`` int64[t,l,3].
 
-    A level is its first texel, width and height; width 0 where a texture has no such level.
+    A level is its first texel, width and height; after a texture's last level of one texel that level repeats.
     """
 
     texels: NDArray[np.uint32]
@@ -35,11 +35,12 @@ class Mips:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """A textured mesh. Faces are two-sided; winding carries no meaning.
+    """A textured mesh. Faces are seen from both sides, except those marked ``closed``.
 
     ``vertices`` float64[n,3] in m, z up; ``faces`` int32[m,3]; ``uv`` float32[m,3,2] per face corner, (0, 0) at the
     top left of the texture and v downwards, clamped outside 0..1; ``texture`` int32[m] per face; ``textures`` RGB
-    images; ``shade`` float32[m,3] baked brightness per face corner (1 leaves the texture as it is).
+    images; ``closed`` bool[m] marks faces of closed bodies, whose corners run clockwise seen from outside and whose
+    backs the renderer skips; ``shade`` float32[m,3] baked brightness per face corner (1 leaves the texture as it is).
     ``blocks`` float64[k,8] are the plan-view footprints of what stands on the floor, four corners x, y in turn.
     ``walk_xy`` float64[j,2] is a closed polyline (the last point leads to the first) through free floor for a
     mapping walk. ``floor_bounds`` (x0, y0, x1, y1) is the floor's rectangle.
@@ -50,6 +51,7 @@ class Scene:
     uv: NDArray[np.float32]
     texture: NDArray[np.int32]
     textures: tuple[Rgb, ...]
+    closed: NDArray[np.bool_]
     shade: NDArray[np.float32]
     blocks: Array
     walk_xy: Array
@@ -111,7 +113,7 @@ class Scene:
         x, y = width_m / 2, height_m / 2
         corners = np.array([[-x, y, 0.0], [x, y, 0.0], [x, -y, 0.0], [-x, -y, 0.0]])
         uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-        return self._with_quads(world_from_quad.apply(corners)[None], uv[None], _enlarged(texture), 1.0)
+        return self._with_quads(world_from_quad.apply(corners)[None], uv[None], _enlarged(texture), 1.0, closed=False)
 
     def with_box(self, world_from_box: Pose, size_m: ArrayLike, *, rgb: tuple[int, int, int]) -> Scene:
         """Return the scene with a box of one colour centred on a pose, of size (x, y, z) in m; no footprint."""
@@ -121,14 +123,14 @@ class Scene:
         normals = world_from_box.rotation.apply(quads.mean(axis=1) / half)
         uv = np.tile(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (6, 1, 1))
         shade = 0.78 + 0.2 * normals[:, 2] - 0.05 * normals[:, 0]
-        return self._with_quads(corners, uv, np.full((1, 1, 3), rgb, np.uint8), shade[:, None])
+        return self._with_quads(corners, uv, np.full((1, 1, 3), rgb, np.uint8), shade[:, None], closed=True)
 
     def with_block(self, corners_xy: ArrayLike) -> Scene:
         """Return the scene with a further footprint, four corners (4, 2) in turn, that `free_floor` avoids."""
         block = np.asarray(corners_xy, dtype=np.float64).reshape(1, 8)
         return dataclasses.replace(self, blocks=np.concatenate([self.blocks, block]))
 
-    def _with_quads(self, corners: Array, uv: Array, texture: Rgb, shade: float | Array) -> Scene:
+    def _with_quads(self, corners: Array, uv: Array, texture: Rgb, shade: float | Array, *, closed: bool) -> Scene:
         count = len(corners)
         first = len(self.vertices) + 4 * np.arange(count)[:, None]
         faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
@@ -141,6 +143,7 @@ class Scene:
             uv=np.concatenate([self.uv, corner_uv.astype(np.float32)]),
             texture=np.concatenate([self.texture, np.full(2 * count, len(self.textures), np.int32)]),
             textures=(*self.textures, texture),
+            closed=np.concatenate([self.closed, np.full(2 * count, closed)]),
             shade=np.concatenate([self.shade, np.tile(values, (2, 1)).astype(np.float32)]),
         )
 
@@ -186,9 +189,8 @@ def _mip_chains(textures: tuple[Rgb, ...]) -> Mips:
             if width == 1 and height == 1:
                 break
             level = cv2.resize(level, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
-    levels = np.zeros((len(textures), max(map(len, rows)), 3), np.int64)
-    for i, row in enumerate(rows):
-        levels[i, : len(row)] = row
+    longest = max(map(len, rows))
+    levels = np.array([row + [row[-1]] * (longest - len(row)) for row in rows], np.int64)
     return Mips(np.concatenate(chunks), levels)
 
 

@@ -1,8 +1,9 @@
 """Numba kernels of the rasteriser: triangle setup, binning, visibility and texturing of pinhole images.
 
-A triangle is rasterised in 2-D homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous
-coordinates", 1997), so nothing is clipped. With p_i = K x_i the edge functions are e_0 = p_1 x p_2 and cyclically; a pixel
-q = (u, v, 1) lies inside when all e_i . q have the sign of det [p_0 p_1 p_2], and 1 / z = sum(e_i) . q / det there.
+A triangle is rasterised in 2-D homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D
+homogeneous coordinates", 1997), so nothing is clipped. With p_i = K x_i the edge functions are e_0 = p_1 x p_2 and
+cyclically; a pixel q = (u, v, 1) lies inside when all e_i . q have the sign of det [p_0 p_1 p_2], and there
+1 / z = sum(e_i) . q / det.
 Two triangles that share an edge compute exactly negated edge functions, so no sample falls between them.
 
 fastmath stays off and every tile is written by one thread alone: any number of threads gives the same bits.
@@ -17,7 +18,10 @@ from numpy.typing import NDArray
 TILE = 32
 NEAR_M = 1e-3
 MAX_TAPS = 8
-LOD_BIAS = -0.5
+# A level of detail half a level finer than the footprint asks for: 2 ** -0.5.
+LOD_FACTOR = 0.7071067811865476
+# Taps are the rounded-up ratio of the footprint's axes, but a quarter too long still gets no further tap.
+_TAP_ROUNDING = 0.75
 
 # The rotated grid, then the centre: sample k of a pixel lies at its centre plus (DX[k], DY[k]).
 _DX = (-0.125, 0.375, 0.125, -0.375, 0.0)
@@ -59,6 +63,7 @@ def _bounds(p: NDArray, face: NDArray, limit: float) -> tuple[float, float, floa
 def setup(
     vertices: NDArray,
     faces: NDArray,
+    closed: NDArray,
     uv: NDArray,
     shade: NDArray,
     matrix: NDArray,
@@ -67,7 +72,8 @@ def setup(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Set up the triangles that may touch the image.
 
-    vertices f64[n,3]; faces i32[m,3]; uv f32[m,3,2]; shade f32[m,3]; matrix f64[3,4] = K cam_from_world.
+    vertices f64[n,3]; faces i32[m,3]; closed bool[m]; uv f32[m,3,2]; shade f32[m,3];
+    matrix f64[3,4] = K cam_from_world.
     Returns planes f64[k,21] (three edges, 1/z, u/z, v/z, shade/z; each a, b, c of a*x + b*y + c), boxes i32[k,4]
     (first and last pixel column and row: x0, y0, x1, y1) and the index of the face i32[k].
     """
@@ -92,7 +98,7 @@ def setup(
             edges[i, 1] = p[s, 2] * p[t, 0] - p[s, 0] * p[t, 2]
             edges[i, 2] = p[s, 0] * p[t, 1] - p[s, 1] * p[t, 0]
         det = p[a, 0] * edges[0, 0] + p[a, 1] * edges[0, 1] + p[a, 2] * edges[0, 2]
-        if det == 0.0:
+        if det == 0.0 or (closed[f] and det < 0.0):
             continue
         sign = 1.0 if det > 0.0 else -1.0
         size = abs(det)
@@ -105,10 +111,10 @@ def setup(
             planes[k, 12 + j] = (e0 * uv[f, 0, 0] + e1 * uv[f, 1, 0] + e2 * uv[f, 2, 0]) / size
             planes[k, 15 + j] = (e0 * uv[f, 0, 1] + e1 * uv[f, 1, 1] + e2 * uv[f, 2, 1]) / size
             planes[k, 18 + j] = (e0 * shade[f, 0] + e1 * shade[f, 1] + e2 * shade[f, 2]) / size
-        boxes[k, 0] = max(0, int(math.floor(x0)))
-        boxes[k, 1] = max(0, int(math.floor(y0)))
-        boxes[k, 2] = min(width - 1, int(math.floor(x1)))
-        boxes[k, 3] = min(height - 1, int(math.floor(y1)))
+        boxes[k, 0] = max(0, math.floor(x0))
+        boxes[k, 1] = max(0, math.floor(y0))
+        boxes[k, 2] = min(width - 1, math.floor(x1))
+        boxes[k, 3] = min(height - 1, math.floor(y1))
         source[k] = f
         k += 1
     return planes[:k].copy(), boxes[:k].copy(), source[:k].copy()
@@ -159,28 +165,31 @@ def bin_tiles(planes: NDArray, boxes: NDArray, width: int, height: int) -> tuple
 
 
 @njit(cache=True)
-def _clamped(value: float, low: int, high: int) -> int:
-    if value <= low:
-        return low
-    if value >= high:
-        return high
-    return int(value)
+def _floor(value: float, low: int, high: int) -> int:
+    """Round down into low..high; clamped first, since a huge value has no whole number."""
+    return low if value <= low else high if value >= high else math.floor(value)
+
+
+@njit(cache=True)
+def _ceil(value: float, low: int, high: int) -> int:
+    """Round up into low..high."""
+    return low if value <= low else high if value >= high else math.ceil(value)
 
 
 @njit(cache=True)
 def _row_spans(plane: NDArray, y: float, first: int, stop: int) -> tuple[int, int, int, int]:
-    """Return columns [lo, hi) that a triangle may touch in the row at y, and [inner_lo, inner_hi) that it covers wholly."""
+    """Return columns [lo, hi) a triangle may touch in the row at y, and [inner_lo, inner_hi) it covers wholly."""
     lo, hi, inner_lo, inner_hi = first, stop, first, stop
     for i in range(3):
         a, b = plane[3 * i], plane[3 * i + 1]
         r = b * y + plane[3 * i + 2]
         m = _REACH * (abs(a) + abs(b))
         if a > 0.0:
-            lo = max(lo, _clamped(math.floor((-r - m) / a - 0.5 - 1e-6), first, stop))
-            inner_lo = max(inner_lo, _clamped(math.ceil((-r + m) / a - 0.5 + 1e-6), first, stop))
+            lo = max(lo, _floor((-r - m) / a - 0.5 - 1e-6, first, stop))
+            inner_lo = max(inner_lo, _ceil((-r + m) / a - 0.5 + 1e-6, first, stop))
         elif a < 0.0:
-            hi = min(hi, _clamped(math.floor((-r - m) / a - 0.5 + 1e-6) + 1.0, first, stop))
-            inner_hi = min(inner_hi, _clamped(math.ceil((-r + m) / a - 0.5 - 1e-6), first, stop))
+            hi = min(hi, _floor((-r - m) / a + 0.5 + 1e-6, first, stop))
+            inner_hi = min(inner_hi, _ceil((-r + m) / a - 0.5 - 1e-6, first, stop))
         else:
             if r + m < 0.0:
                 hi = lo
@@ -224,31 +233,35 @@ def _cover(plane: NDArray, k: int, box: NDArray, tile: tuple, w_max: NDArray, ow
         for s in range(5):
             # The same order of sums as in _partial: a surface has one depth whichever way a sample is reached.
             base = plane[10] * (y + 0.5 + _DY[s]) + plane[11]
-            for x in range(inner_lo, inner_hi):
-                w = plane[9] * (x + 0.5 + _DX[s]) + base
-                nearer = w > w_max[s, row, x - tx]
-                w_max[s, row, x - tx] = w if nearer else w_max[s, row, x - tx]
-                owner[s, row, x - tx] = k if nearer else owner[s, row, x - tx]
+            # Slices from their start, so that the loop needs no test for negative indices and becomes SIMD.
+            nearest = w_max[s, row, inner_lo - tx : inner_hi - tx]
+            owners = owner[s, row, inner_lo - tx : inner_hi - tx]
+            for i in range(inner_hi - inner_lo):
+                w = plane[9] * (inner_lo + i + 0.5 + _DX[s]) + base
+                nearer = w > nearest[i]
+                nearest[i] = w if nearer else nearest[i]
+                owners[i] = k if nearer else owners[i]
 
 
 @njit(cache=True)
-def _bilinear(texels: NDArray, start: int, width: int, height: int, u: float, v: float) -> tuple:
-    """Return red, green, blue 0..255 of one mip level at (u, v) in 0..1, clamped at its border."""
-    x = u * width - 0.5
-    y = v * height - 0.5
-    x = min(max(x, 0.0), width - 1.0)
-    y = min(max(y, 0.0), height - 1.0)
-    x0, y0 = int(x), int(y)
-    x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
-    fx, fy = x - x0, y - y0
-    p00, p10 = int(texels[start + y0 * width + x0]), int(texels[start + y0 * width + x1])
-    p01, p11 = int(texels[start + y1 * width + x0]), int(texels[start + y1 * width + x1])
-    w00, w10, w01, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-    return (
-        w00 * (p00 & 255) + w10 * (p10 & 255) + w01 * (p01 & 255) + w11 * (p11 & 255),
-        w00 * (p00 >> 8 & 255) + w10 * (p10 >> 8 & 255) + w01 * (p01 >> 8 & 255) + w11 * (p11 >> 8 & 255),
-        w00 * (p00 >> 16 & 255) + w10 * (p10 >> 16 & 255) + w01 * (p01 >> 16 & 255) + w11 * (p11 >> 16 & 255),
-    )
+def _bilinear(texels: NDArray, start: int, width: int, height: int, u: float, v: float) -> tuple[int, int]:
+    """Return a mip level at (u, v) in 0..1, clamped at its border: red | green << 32, and blue, times 65536.
+
+    Weights are multiples of 1/256, as on graphics processors; whole numbers add up in any order to the same bits.
+    """
+    x = min(max(256.0 * (u * width) - 128.0, 0.0), 256.0 * (width - 1)) + 0.5
+    y = min(max(256.0 * (v * height) - 128.0, 0.0), 256.0 * (height - 1)) + 0.5
+    ix, iy = int(x), int(y)
+    fx, fy = ix & 255, iy & 255
+    at = start + (iy >> 8) * width + (ix >> 8)
+    right = 1 if fx > 0 else 0
+    below = width if fy > 0 else 0
+    p00, p10 = np.int64(texels[np.uint64(at)]), np.int64(texels[np.uint64(at + right)])
+    p01, p11 = np.int64(texels[np.uint64(at + below)]), np.int64(texels[np.uint64(at + below + right)])
+    w00, w10, w01, w11 = (256 - fx) * (256 - fy), fx * (256 - fy), (256 - fx) * fy, fx * fy
+    red_green = w00 * (p00 & 255 | (p00 & 0xFF00) << 24) + w10 * (p10 & 255 | (p10 & 0xFF00) << 24)
+    red_green += w01 * (p01 & 255 | (p01 & 0xFF00) << 24) + w11 * (p11 & 255 | (p11 & 0xFF00) << 24)
+    return red_green, w00 * (p00 >> 16) + w10 * (p10 >> 16) + w01 * (p01 >> 16) + w11 * (p11 >> 16)
 
 
 @njit(cache=True)
@@ -272,50 +285,58 @@ def _footprint(ux: float, vx: float, uy: float, vy: float) -> tuple[float, float
 
 
 @njit(cache=True)
-def _texture(texels: NDArray, levels: NDArray, u: float, v: float, j: tuple) -> tuple:
+def _texture(texels: NDArray, levels: NDArray, texture: int, u: float, v: float, j: tuple) -> tuple:
     """Filter a texture at (u, v): trilinear, with up to MAX_TAPS taps along the longer axis of the footprint.
 
-    levels i64[l,3] (start, width, height; width 0 where a level does not exist); j = du/dx, dv/dx, du/dy, dv/dy.
+    levels i64[t,l,3] (start, width, height); j = du/dx, dv/dx, du/dy, dv/dy.
     """
-    width, height = levels[0, 1], levels[0, 2]
+    width, height = levels[texture, 0, 1], levels[texture, 0, 2]
     long, short, dx, dy = _footprint(j[0] * width, j[1] * height, j[2] * width, j[3] * height)
-    if long > MAX_TAPS * short:
-        taps = MAX_TAPS
-    else:
-        taps = max(1, int(math.ceil(long / short - 0.01)))
-    lod = math.log2(max(long / taps, 1e-9)) + LOD_BIAS
-    last = levels.shape[0] - 1
-    while levels[last, 1] == 0:
-        last -= 1
-    lod = min(max(lod, 0.0), float(last))
-    low = min(int(lod), last)
-    blend = lod - low
-    red = green = blue = 0.0
+    taps = MAX_TAPS if long > MAX_TAPS * short else max(1, int(long / short + _TAP_ROUNDING))
+    low, size = 0, LOD_FACTOR * long / taps
+    while size >= 2.0 and low < levels.shape[1] - 1:
+        size *= 0.5
+        low += 1
+    # A parabola through log2 at 1 and 2: a hundredth of a level off at most, and the same on every machine.
+    blend = (2.0 - size / 3.0) * size - 5.0 / 3.0 if size > 1.0 else 0.0
+    blend = 0.0 if low == levels.shape[1] - 1 else blend
+    near_rg = near_b = far_rg = far_b = 0
+    next_low = min(low + 1, levels.shape[1] - 1)
+    start0, width0, height0 = levels[texture, low, 0], levels[texture, low, 1], levels[texture, low, 2]
+    start1, width1, height1 = (
+        levels[texture, next_low, 0],
+        levels[texture, next_low, 1],
+        levels[texture, next_low, 2],
+    )
+    step_u, step_v = long * dx / width, long * dy / height
     for k in range(taps):
-        along = long * ((k + 0.5) / taps - 0.5)
-        s, t = u + along * dx / width, v + along * dy / height
-        r, g, b = _bilinear(texels, levels[low, 0], levels[low, 1], levels[low, 2], s, t)
+        along = (k + 0.5) / taps - 0.5
+        s, t = u + along * step_u, v + along * step_v
+        rg, b = _bilinear(texels, start0, width0, height0, s, t)
+        near_rg, near_b = near_rg + rg, near_b + b
         if blend > 0.0:
-            r1, g1, b1 = _bilinear(texels, levels[low + 1, 0], levels[low + 1, 1], levels[low + 1, 2], s, t)
-            r, g, b = r + blend * (r1 - r), g + blend * (g1 - g), b + blend * (b1 - b)
-        red, green, blue = red + r, green + g, blue + b
-    return red / taps, green / taps, blue / taps
+            rg, b = _bilinear(texels, start1, width1, height1, s, t)
+            far_rg, far_b = far_rg + rg, far_b + b
+    near, far = (1.0 - blend) / (65536.0 * taps), blend / (65536.0 * taps)
+    red = near * (near_rg & 0xFFFFFFFF) + far * (far_rg & 0xFFFFFFFF)
+    green = near * (near_rg >> 32) + far * (far_rg >> 32)
+    return red, green, near * near_b + far * far_b
 
 
 @njit(cache=True)
-def _shade(plane: NDArray, x: float, y: float, texels: NDArray, levels: NDArray) -> tuple:
+def _shade(planes: NDArray, k: int, x: float, y: float, texels: NDArray, levels: NDArray, texture: int) -> tuple:
     """Return red, green, blue 0..255 of a triangle seen at pixel position (x, y)."""
-    w = plane[9] * x + plane[10] * y + plane[11]
-    u = (plane[12] * x + plane[13] * y + plane[14]) / w
-    v = (plane[15] * x + plane[16] * y + plane[17]) / w
-    light = (plane[18] * x + plane[19] * y + plane[20]) / w
+    w = planes[k, 9] * x + planes[k, 10] * y + planes[k, 11]
+    u = (planes[k, 12] * x + planes[k, 13] * y + planes[k, 14]) / w
+    v = (planes[k, 15] * x + planes[k, 16] * y + planes[k, 17]) / w
+    light = (planes[k, 18] * x + planes[k, 19] * y + planes[k, 20]) / w
     j = (
-        (plane[12] - u * plane[9]) / w,
-        (plane[15] - v * plane[9]) / w,
-        (plane[13] - u * plane[10]) / w,
-        (plane[16] - v * plane[10]) / w,
+        (planes[k, 12] - u * planes[k, 9]) / w,
+        (planes[k, 15] - v * planes[k, 9]) / w,
+        (planes[k, 13] - u * planes[k, 10]) / w,
+        (planes[k, 16] - v * planes[k, 10]) / w,
     )
-    red, green, blue = _texture(texels, levels, u, v, j)
+    red, green, blue = _texture(texels, levels, texture, u, v, j)
     return light * red, light * green, light * blue
 
 
@@ -369,7 +390,7 @@ def _resolve(
                     r, g, b = background[0], background[1], background[2]
                 else:
                     at_x, at_y = x + 0.5 + dx, y + 0.5 + dy
-                    r, g, b = _shade(planes[k], at_x, at_y, texels, levels[texture_of[k]])
+                    r, g, b = _shade(planes, k, at_x, at_y, texels, levels, texture_of[k])
                 red, green, blue = red + count * r, green + count * g, blue + count * b
                 done += count
             rgb[y, x, 0] = np.uint8(min(255.0, red / samples + 0.5))

@@ -79,7 +79,14 @@ def _directions(camera: Camera) -> Array:
 def _draw(scene: Scene, matrix: Array, size: tuple[int, int], *, samples: int) -> _Drawn:
     width, height = size
     planes, boxes, source = raster.setup(
-        scene.vertices, scene.faces, scene.uv, scene.shade, np.ascontiguousarray(matrix), width, height
+        scene.vertices,
+        scene.faces,
+        scene.closed,
+        scene.uv,
+        scene.shade,
+        np.ascontiguousarray(matrix),
+        width,
+        height,
     )
     starts, members = raster.bin_tiles(planes, boxes, width, height)
     rgb, depth, seen = raster.draw(
@@ -102,9 +109,7 @@ def _draw(scene: Scene, matrix: Array, size: tuple[int, int], *, samples: int) -
 RENDERERS: dict[str, Callable[..., Image]] = {"numba": render_numba}
 
 
-def render(
-    scene: Scene, camera: Camera, world_from_cam: Pose, *, samples: int = 4, renderer: str = "numba"
-) -> Image:
+def render(scene: Scene, camera: Camera, world_from_cam: Pose, *, samples: int = 4, renderer: str = "numba") -> Image:
     """Render what a camera sees from a pose.
 
     ``samples`` per pixel is 4 (rotated grid) or 1 (centre). Colour is gamma encoded, as the textures are; depth is

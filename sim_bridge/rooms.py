@@ -163,7 +163,7 @@ def _furnish_island(build: Builder, rng: np.random.Generator, island: tuple[floa
 
 
 def _walk() -> Array:
-    """Return the walk as a closed polyline f64[k,2]: a figure of eight around the islands, its corners cut by 0.35 m."""
+    """Return the walk, a closed polyline f64[k,2]: a figure of eight around the islands with its corners cut."""
     near, far = _LOOP_M, LENGTH_M - _LOOP_M
     south, north = _LOOP_M, WIDTH_M - _LOOP_M
     eight = [

@@ -12,7 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 Rgb = NDArray[np.uint8]
 Float = NDArray[np.float32]
 
-_FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX)
+_FONTS = (
+    cv2.FONT_HERSHEY_SIMPLEX,
+    cv2.FONT_HERSHEY_DUPLEX,
+    cv2.FONT_HERSHEY_COMPLEX,
+    cv2.FONT_HERSHEY_TRIPLEX,
+)
 
 
 def fractal(rng: np.random.Generator, size: tuple[int, int], *, cell_px: float, octaves: int = 4) -> Float:
@@ -289,7 +294,10 @@ def doors(rng: np.random.Generator, size: tuple[int, int], *, base: ArrayLike) -
             cv2.rectangle(image, handle, (handle[0] + 8, handle[1] + max(height // 12, 8)), (215, 215, 220), -1)
             if rng.random() < 0.6:
                 note = shapes(rng, (max(height // 8, 16), max(width // 8, 16)))
-                y, x = int(rng.uniform(y0, y1 - note.shape[0])), int(rng.uniform(x0, max(x1 - note.shape[1], x0 + 1)))
+                y, x = (
+                    int(rng.uniform(y0, y1 - note.shape[0])),
+                    int(rng.uniform(x0, max(x1 - note.shape[1], x0 + 1))),
+                )
                 target = image[y : y + note.shape[0], x : x + note.shape[1]]
                 target[:] = note[: target.shape[0], : target.shape[1]]
     return image
