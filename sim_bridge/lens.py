@@ -3,11 +3,18 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from sim_bridge.kernels import kernel, parallel_kernel
 
-@njit(cache=True)
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Ints = NDArray[np.int32]
+Bytes = NDArray[np.uint8]
+
+
+@kernel
 def _lagrange(t: float) -> tuple[float, float, float, float]:
     """Return the weights of four nodes at -1, 0, 1, 2 for a position t in 0..1: exact for cubics."""
     return (
@@ -18,7 +25,7 @@ def _lagrange(t: float) -> tuple[float, float, float, float]:
     )
 
 
-@njit(cache=True)
+@kernel
 def _keys(t: float) -> tuple[float, float, float, float]:
     """Return the weights of the cubic convolution of Keys (1981), a = -1/2, for a position t in 0..1."""
     return (
@@ -29,8 +36,8 @@ def _keys(t: float) -> tuple[float, float, float, float]:
     )
 
 
-@njit(cache=True)
-def _row_map(nodes: NDArray, step: int, y: int) -> NDArray:
+@kernel
+def _row_map(nodes: Floats, step: int, y: int) -> Floats:
     """Return the nodes of a row y, interpolated between the rows of nodes: f64[cols,2]."""
     first = y // step
     w = _lagrange((y - first * step) / step)
@@ -42,8 +49,8 @@ def _row_map(nodes: NDArray, step: int, y: int) -> NDArray:
     return out
 
 
-@njit(cache=True)
-def _depth_at(x: float, y: float, seen: NDArray, planes: NDArray) -> float:
+@kernel
+def _depth_at(x: float, y: float, seen: Ints, planes: Floats) -> float:
     """Return the exact depth at a pinhole pixel position: the nearest triangle there of those seen around it."""
     col, row = math.floor(x - 0.5), math.floor(y - 0.5)
     best = 0.0
@@ -65,10 +72,10 @@ def _depth_at(x: float, y: float, seen: NDArray, planes: NDArray) -> float:
     return 1.0 / best if best > 0.0 else 0.0
 
 
-@njit(cache=True, parallel=True)
+@parallel_kernel
 def bend(
-    rgb: NDArray, seen: NDArray, planes: NDArray, nodes: NDArray, step: int, width: int, height: int
-) -> tuple[NDArray, NDArray]:
+    rgb: Bytes, seen: Ints, planes: Floats, nodes: Floats, step: int, width: int, height: int
+) -> tuple[Bytes, Singles]:
     """Resample a pinhole image by cubic convolution: rgb u8[h,w,3] and exact depth f32[h,w].
 
     rgb u8[hp,wp,3] and seen i32[hp,wp] (triangle at the pixel centre) are the pinhole's; planes f64[k,21] the

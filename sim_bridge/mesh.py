@@ -99,7 +99,7 @@ class Scene:
         points = np.atleast_2d(np.asarray(xy, dtype=np.float64))
         x0, y0, x1, y1 = self.floor_bounds
         low, high = np.array([x0, y0]) + radius_m, np.array([x1, y1]) - radius_m
-        free = ((points >= low) & (points <= high)).all(axis=1)
+        free: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
         for block in self.blocks:
             free &= _distance_to_block(points, block.reshape(4, 2)) >= radius_m
         return free
@@ -181,8 +181,8 @@ def _mip_chains(textures: tuple[Rgb, ...]) -> Mips:
         level = image.astype(np.float32)
         rows.append([])
         while True:
-            packed = np.rint(level).astype(np.uint32)
-            chunks.append((packed[..., 0] | packed[..., 1] << 8 | packed[..., 2] << 16).ravel())
+            red, green, blue = np.moveaxis(np.rint(level).astype(np.uint32), 2, 0)
+            chunks.append((red | green << np.uint32(8) | blue << np.uint32(16)).ravel())
             height, width = level.shape[:2]
             rows[-1].append((start, width, height))
             start += width * height

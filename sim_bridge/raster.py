@@ -12,8 +12,20 @@ fastmath stays off and every tile is written by one thread alone: any number of 
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from sim_bridge.kernels import kernel, parallel_kernel
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Ints = NDArray[np.int32]
+Longs = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint32]
+Flags = NDArray[np.bool_]
+Tile = tuple[int, int, int, int]
+Colour = tuple[float, float, float]
 
 TILE = 32
 NEAR_M = 1e-3
@@ -30,8 +42,8 @@ _DY = (-0.375, -0.125, 0.375, 0.125, 0.0)
 _REACH = 0.375
 
 
-@njit(cache=True)
-def _transform(vertices: NDArray, matrix: NDArray) -> NDArray:
+@kernel
+def _transform(vertices: Floats, matrix: Floats) -> Floats:
     out = np.empty((vertices.shape[0], 3))
     for i in range(vertices.shape[0]):
         x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
@@ -40,8 +52,8 @@ def _transform(vertices: NDArray, matrix: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True)
-def _bounds(p: NDArray, face: NDArray, limit: float) -> tuple[float, float, float, float]:
+@kernel
+def _bounds(p: Floats, face: Ints, limit: float) -> tuple[float, float, float, float]:
     """Return the pixel bounds (x0, y0, x1, y1) of the part of a triangle beyond the near plane."""
     x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
     for i in range(3):
@@ -59,17 +71,17 @@ def _bounds(p: NDArray, face: NDArray, limit: float) -> tuple[float, float, floa
     return max(x0, -limit), max(y0, -limit), min(x1, limit), min(y1, limit)
 
 
-@njit(cache=True)
+@kernel
 def setup(
-    vertices: NDArray,
-    faces: NDArray,
-    closed: NDArray,
-    uv: NDArray,
-    shade: NDArray,
-    matrix: NDArray,
+    vertices: Floats,
+    faces: Ints,
+    closed: Flags,
+    uv: Singles,
+    shade: Singles,
+    matrix: Floats,
     width: int,
     height: int,
-) -> tuple[NDArray, NDArray, NDArray]:
+) -> tuple[Floats, Ints, Ints]:
     """Set up the triangles that may touch the image.
 
     vertices f64[n,3]; faces i32[m,3]; closed bool[m]; uv f32[m,3,2]; shade f32[m,3];
@@ -120,8 +132,8 @@ def setup(
     return planes[:k].copy(), boxes[:k].copy(), source[:k].copy()
 
 
-@njit(cache=True)
-def _misses(plane: NDArray, x0: float, y0: float, x1: float, y1: float) -> bool:
+@kernel
+def _misses(plane: Floats, x0: float, y0: float, x1: float, y1: float) -> bool:
     """Return whether a triangle lies wholly outside a rectangle, judged by its edges (may return False for a miss)."""
     for i in range(3):
         a, b, c = plane[3 * i], plane[3 * i + 1], plane[3 * i + 2]
@@ -132,8 +144,8 @@ def _misses(plane: NDArray, x0: float, y0: float, x1: float, y1: float) -> bool:
     return False
 
 
-@njit(cache=True)
-def bin_tiles(planes: NDArray, boxes: NDArray, width: int, height: int) -> tuple[NDArray, NDArray]:
+@kernel
+def bin_tiles(planes: Floats, boxes: Ints, width: int, height: int) -> tuple[Longs, Ints]:
     """Sort triangles into tiles, in the order of the faces: starts i64[tiles+1] and the triangle list i32[...]."""
     across = (width + TILE - 1) // TILE
     down = (height + TILE - 1) // TILE
@@ -164,20 +176,20 @@ def bin_tiles(planes: NDArray, boxes: NDArray, width: int, height: int) -> tuple
     return starts, members
 
 
-@njit(cache=True)
+@kernel
 def _floor(value: float, low: int, high: int) -> int:
     """Round down into low..high; clamped first, since a huge value has no whole number."""
     return low if value <= low else high if value >= high else math.floor(value)
 
 
-@njit(cache=True)
+@kernel
 def _ceil(value: float, low: int, high: int) -> int:
     """Round up into low..high."""
     return low if value <= low else high if value >= high else math.ceil(value)
 
 
-@njit(cache=True)
-def _row_spans(plane: NDArray, y: float, first: int, stop: int) -> tuple[int, int, int, int]:
+@kernel
+def _row_spans(plane: Floats, y: float, first: int, stop: int) -> tuple[int, int, int, int]:
     """Return columns [lo, hi) a triangle may touch in the row at y, and [inner_lo, inner_hi) it covers wholly."""
     lo, hi, inner_lo, inner_hi = first, stop, first, stop
     for i in range(3):
@@ -200,8 +212,8 @@ def _row_spans(plane: NDArray, y: float, first: int, stop: int) -> tuple[int, in
     return lo, hi, inner_lo, inner_hi
 
 
-@njit(cache=True)
-def _partial(plane: NDArray, k: int, x: int, y: int, col: int, row: int, w_max: NDArray, owner: NDArray) -> None:
+@kernel
+def _partial(plane: Floats, k: int, x: int, y: int, col: int, row: int, w_max: Floats, owner: Ints) -> None:
     """Test the five samples of one pixel against the edges and the nearest surface so far."""
     for s in range(5):
         u = x + 0.5 + _DX[s]
@@ -218,8 +230,8 @@ def _partial(plane: NDArray, k: int, x: int, y: int, col: int, row: int, w_max: 
             owner[s, row, col] = k
 
 
-@njit(cache=True)
-def _cover(plane: NDArray, k: int, box: NDArray, tile: tuple, w_max: NDArray, owner: NDArray) -> None:
+@kernel
+def _cover(plane: Floats, k: int, box: Ints, tile: Tile, w_max: Floats, owner: Ints) -> None:
     """Enter one triangle into the visibility buffer of a tile (x0, y0, x1, y1)."""
     tx, ty, tx1, ty1 = tile
     first, stop = max(box[0], tx), min(box[2] + 1, tx1)
@@ -243,8 +255,8 @@ def _cover(plane: NDArray, k: int, box: NDArray, tile: tuple, w_max: NDArray, ow
                 owners[i] = k if nearer else owners[i]
 
 
-@njit(cache=True)
-def _bilinear(texels: NDArray, start: int, width: int, height: int, u: float, v: float) -> tuple[int, int]:
+@kernel
+def _bilinear(texels: Words, start: int, width: int, height: int, u: float, v: float) -> tuple[int, int]:
     """Return a mip level at (u, v) in 0..1, clamped at its border: red | green << 32, and blue, times 65536.
 
     Weights are multiples of 1/256, as on graphics processors; whole numbers add up in any order to the same bits.
@@ -261,10 +273,11 @@ def _bilinear(texels: NDArray, start: int, width: int, height: int, u: float, v:
     w00, w10, w01, w11 = (256 - fx) * (256 - fy), fx * (256 - fy), (256 - fx) * fy, fx * fy
     red_green = w00 * (p00 & 255 | (p00 & 0xFF00) << 24) + w10 * (p10 & 255 | (p10 & 0xFF00) << 24)
     red_green += w01 * (p01 & 255 | (p01 & 0xFF00) << 24) + w11 * (p11 & 255 | (p11 & 0xFF00) << 24)
-    return red_green, w00 * (p00 >> 16) + w10 * (p10 >> 16) + w01 * (p01 >> 16) + w11 * (p11 >> 16)
+    blue = w00 * (p00 >> 16) + w10 * (p10 >> 16) + w01 * (p01 >> 16) + w11 * (p11 >> 16)
+    return int(red_green), int(blue)
 
 
-@njit(cache=True)
+@kernel
 def _footprint(ux: float, vx: float, uy: float, vy: float) -> tuple[float, float, float, float]:
     """Return the axes of a pixel in texels: long and short length, and the unit direction of the long one.
 
@@ -284,8 +297,10 @@ def _footprint(ux: float, vx: float, uy: float, vy: float) -> tuple[float, float
     return long, short, 1.0, 0.0
 
 
-@njit(cache=True)
-def _texture(texels: NDArray, levels: NDArray, texture: int, u: float, v: float, j: tuple) -> tuple:
+@kernel
+def _texture(
+    texels: Words, levels: Longs, texture: int, u: float, v: float, j: tuple[float, float, float, float]
+) -> Colour:
     """Filter a texture at (u, v): trilinear, with up to MAX_TAPS taps along the longer axis of the footprint.
 
     levels i64[t,l,3] (start, width, height); j = du/dx, dv/dx, du/dy, dv/dy.
@@ -323,8 +338,8 @@ def _texture(texels: NDArray, levels: NDArray, texture: int, u: float, v: float,
     return red, green, near * near_b + far * far_b
 
 
-@njit(cache=True)
-def _shade(planes: NDArray, k: int, x: float, y: float, texels: NDArray, levels: NDArray, texture: int) -> tuple:
+@kernel
+def _shade(planes: Floats, k: int, x: float, y: float, texels: Words, levels: Longs, texture: int) -> Colour:
     """Return red, green, blue 0..255 of a triangle seen at pixel position (x, y)."""
     w = planes[k, 9] * x + planes[k, 10] * y + planes[k, 11]
     u = (planes[k, 12] * x + planes[k, 13] * y + planes[k, 14]) / w
@@ -340,8 +355,8 @@ def _shade(planes: NDArray, k: int, x: float, y: float, texels: NDArray, levels:
     return light * red, light * green, light * blue
 
 
-@njit(cache=True)
-def _pixel(owner: NDArray, row: int, col: int, samples: int) -> tuple[int, int, float, float]:
+@kernel
+def _pixel(owner: Ints, row: int, col: int, samples: int) -> tuple[int, int, float, float]:
     """Take the next surface that owns samples of a pixel: its index (-1 none), the count and the mean offset.
 
     The samples taken are marked with -2. Shading at the mean of the covered samples keeps off a texture's outside.
@@ -360,20 +375,20 @@ def _pixel(owner: NDArray, row: int, col: int, samples: int) -> tuple[int, int, 
     return found, count, dx / max(count, 1), dy / max(count, 1)
 
 
-@njit(cache=True)
+@kernel
 def _resolve(
-    tile: tuple,
+    tile: Tile,
     samples: int,
-    planes: NDArray,
-    texture_of: NDArray,
-    texels: NDArray,
-    levels: NDArray,
-    background: NDArray,
-    w_max: NDArray,
-    owner: NDArray,
-    rgb: NDArray,
-    depth: NDArray,
-    seen: NDArray,
+    planes: Floats,
+    texture_of: Ints,
+    texels: Words,
+    levels: Longs,
+    background: Floats,
+    w_max: Floats,
+    owner: Ints,
+    rgb: Bytes,
+    depth: Singles,
+    seen: Ints,
 ) -> None:
     """Shade the visibility buffer of a tile into the image."""
     tx, ty, tx1, ty1 = tile
@@ -398,20 +413,20 @@ def _resolve(
             rgb[y, x, 2] = np.uint8(min(255.0, blue / samples + 0.5))
 
 
-@njit(cache=True, parallel=True)
+@parallel_kernel
 def draw(
-    planes: NDArray,
-    boxes: NDArray,
-    texture_of: NDArray,
-    starts: NDArray,
-    members: NDArray,
-    texels: NDArray,
-    levels: NDArray,
-    background: NDArray,
+    planes: Floats,
+    boxes: Ints,
+    texture_of: Ints,
+    starts: Longs,
+    members: Ints,
+    texels: Words,
+    levels: Longs,
+    background: Floats,
     width: int,
     height: int,
     samples: int,
-) -> tuple[NDArray, NDArray, NDArray]:
+) -> tuple[Bytes, Singles, Ints]:
     """Draw binned triangles: rgb u8[h,w,3], depth f32[h,w] along the camera's axis (0 where nothing is) and the
     triangle i32[h,w] at each pixel centre (-1 where none is).
 

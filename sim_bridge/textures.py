@@ -40,10 +40,15 @@ def colour(rng: np.random.Generator, *, low: int = 30, high: int = 230) -> tuple
     return r, g, b
 
 
+def to_bytes(image: NDArray[np.floating]) -> Rgb:
+    """Cut grey levels to 0..255 and drop their fractions."""
+    result: Rgb = np.clip(image, 0, 255).astype(np.uint8)
+    return result
+
+
 def tinted(base: ArrayLike, change: Float) -> Rgb:
     """Return an image of one colour (3,) whose brightness changes by f32[h,w] grey levels."""
-    image = np.asarray(base, dtype=np.float32) + change[..., None]
-    return np.clip(image, 0, 255).astype(np.uint8)
+    return to_bytes(np.asarray(base, dtype=np.float32) + change[..., None])
 
 
 def plaster(rng: np.random.Generator, size: tuple[int, int], *, base: ArrayLike) -> Rgb:
@@ -79,8 +84,9 @@ def planks(rng: np.random.Generator, size: tuple[int, int], *, px_per_m: float) 
             left = right
         top = bottom
     dirt = 7 * fractal(rng, size, cell_px=1.5 * px_per_m, octaves=6)
-    image = np.clip(image + dirt[..., None], 0, 255).astype(np.uint8)
-    return _scratched(rng, image, count=int(6 * height * width / px_per_m**2), length_px=0.2 * px_per_m)
+    return _scratched(
+        rng, to_bytes(image + dirt[..., None]), count=int(6 * height * width / px_per_m**2), length_px=0.2 * px_per_m
+    )
 
 
 def _scratched(rng: np.random.Generator, image: Rgb, *, count: int, length_px: float) -> Rgb:
@@ -108,7 +114,7 @@ def carpet(rng: np.random.Generator, size: tuple[int, int]) -> Rgb:
             turns = np.deg2rad(rng.choice([0, 45]) + np.arange(0, 360, 90))
             points = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
             cv2.fillPoly(image, [points.astype(np.int32)], colour(rng))
-    return np.clip(image + 7 * fractal(rng, size, cell_px=2, octaves=1)[..., None], 0, 255).astype(np.uint8)
+    return to_bytes(image + 7 * fractal(rng, size, cell_px=2, octaves=1)[..., None])
 
 
 def _word(rng: np.random.Generator, *, shortest: int = 2, longest: int = 9) -> str:
@@ -156,10 +162,9 @@ def page(rng: np.random.Generator, size: tuple[int, int]) -> Rgb:
 def photo(rng: np.random.Generator, size: tuple[int, int]) -> Rgb:
     """Draw something like a photograph: sky, hills, buildings with windows, grain."""
     height, width = size
-    sky = np.linspace(1.0, 0.4, height, dtype=np.float32)[:, None, None]
-    image = np.clip(sky * np.array(colour(rng, low=120, high=250), np.float32), 0, 255) + np.zeros((1, width, 1))
-    image += 16 * fractal(rng, size, cell_px=max(size) / 4, octaves=6)[..., None]
-    image = np.clip(image, 0, 255).astype(np.uint8)
+    fade = np.linspace(1.0, 0.4, height, dtype=np.float32)[:, None, None]
+    sky = fade * np.array(colour(rng, low=120, high=250), np.float32)
+    image = to_bytes(sky + 16 * fractal(rng, size, cell_px=max(size) / 4, octaves=6)[..., None])
     for depth in range(3):
         line = height * (0.45 + 0.14 * depth) + height * 0.08 * fractal(rng, (1, width), cell_px=width / 4)[0]
         below = np.arange(height)[:, None] > line[None]
@@ -203,7 +208,7 @@ def shapes(rng: np.random.Generator, size: tuple[int, int]) -> Rgb:
             end = centre + 3 * radius * rng.normal(size=2)
             thick = max(1, int(radius / 8))
             cv2.line(image, centre.astype(int).tolist(), end.astype(int).tolist(), colour(rng), thick, cv2.LINE_AA)
-    return tinted(0, 5 * fractal(rng, size, cell_px=3, octaves=2)) // 2 + image // 2 + image // 4
+    return to_bytes(0.8 * image + 5 * fractal(rng, size, cell_px=3, octaves=2)[..., None])
 
 
 def chart(rng: np.random.Generator, size: tuple[int, int]) -> Rgb:

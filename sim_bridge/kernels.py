@@ -1,0 +1,18 @@
+"""Typed decorators for compiled functions. fastmath is off, so that results do not depend on the machine."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def kernel(function: Function) -> Function:
+    """Compile a function with numba and keep the result on disk."""
+    return cast(Function, numba.njit(cache=True)(function))
+
+
+def parallel_kernel(function: Function) -> Function:
+    """Compile a function whose `numba.prange` loops run on all threads of numba."""
+    return cast(Function, numba.njit(cache=True, parallel=True)(function))
