@@ -132,10 +132,11 @@ class _Photo:
 
 @dataclasses.dataclass(frozen=True)
 class _Shot:
-    """A photo and the tags in it that can be calibrated."""
+    """A photo, the tags in it that can be calibrated, and all that were found."""
 
     photo: _Photo
-    detections: tuple[TagDetection, ...]
+    usable: tuple[TagDetection, ...]
+    found: tuple[TagDetection, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,7 +217,7 @@ def _find_tags(
                 continue
             rejected.append(TagPhoto(photo.file, d.id, used=False, reason=reason, visit=photo.visit))
         if usable:
-            shots.append(_Shot(photo, tuple(usable)))
+            shots.append(_Shot(photo, tuple(usable), tuple(found)))
     if not seen:
         raise TagError(
             f"{folder}: none of the {len(listed)} photos shows a tag of {', '.join(families)} (for example "
@@ -246,8 +247,9 @@ def _localize(
             progress("localize photos", number, len(shots))
         image = _read_photo(shot.photo)
         assert image is not None
-        estimate: Estimate = localizer.localize(*_reduced(image, shot.photo.camera, finest_px))
-        for d in shot.detections:
+        covered = _without_tags(image, shot.found)
+        estimate: Estimate = localizer.localize(*_reduced(covered, shot.photo.camera, finest_px))
+        for d in shot.usable:
             if estimate.map_from_cam is None or estimate.covariance is None:
                 reason = f"not localized ({estimate.status}, {estimate.n_inliers} inliers)"
                 failed.append(TagPhoto(shot.photo.file, d.id, used=False, reason=reason, visit=shot.photo.visit))
@@ -255,6 +257,19 @@ def _localize(
                 sighting = Sighting(d, shot.photo.camera, estimate.map_from_cam, estimate.covariance)
                 located.append(_Located(shot.photo, sighting))
     return located, failed
+
+
+def _without_tags(image: Image, detections: Sequence[TagDetection]) -> Image:
+    """Return the photo with its tags painted over, margin included.
+
+    A tag that hung elsewhere while mapping would otherwise pull the photo there.
+    """
+    covered = image.copy()
+    for d in detections:
+        centre = d.corners_px.mean(axis=0)
+        quad = np.round(centre + 1.3 * (d.corners_px - centre)).astype(np.int32)
+        cv2.fillConvexPoly(covered, quad, float(np.median(image)))
+    return covered
 
 
 def _reduced(image: Image, camera: Camera, focal_px: float) -> tuple[Image, Camera]:

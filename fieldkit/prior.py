@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fieldkit.errors import FrameError, PriorError
+from fieldkit.errors import FrameError, PriorError, TagError
 from fieldkit.frames import Array, Pose, Trajectory, compose_covariance
 from fieldkit.protocol import OdometryNoise
 from fieldkit.tags import body_in_map, body_sightings, fuse_sightings
@@ -124,7 +124,10 @@ def _from_tag(
             hint="photograph and calibrate this tag, or correct the start's tag_id",
         )
     frames = [f for f in recording.frames if start.t_begin_ns <= f.t_ns <= start.t_end_ns]
-    found = body_sightings(frames, tag, odometry=recording.odometry)
+    try:
+        found = body_sightings(frames, tag, odometry=recording.odometry)
+    except TagError as error:
+        raise PriorError(f"{what}: start tag {tag.id}: {error.message}", hint=error.hint) from error
     if not found.sightings:
         raise PriorError(
             f"{what}: start tag {tag.id} ({tag.family}) is never seen from {start.t_begin_ns} to {start.t_end_ns} ns: "

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fieldkit.errors import FrameError, TruthError
+from fieldkit.errors import FrameError, TagError, TruthError
 from fieldkit.frames import Array, compose_covariance
 from fieldkit.tags import ARM_COVARIANCE, body_in_map, body_sightings, fuse_sightings
 from fieldkit.types import Recording, TagMap, TagPose, Truth, Visit
@@ -54,7 +54,10 @@ def _from_tag(recording: Recording, visit: Visit, tag: TagPose, what: str) -> di
     views = sorted(visit.views, key=lambda v: v.frame.t_ns)
     standing = [f for f in recording.frames if visit.t_begin_ns <= f.t_ns <= visit.t_end_ns]
     frames = [v.frame for v in views] or standing
-    found = body_sightings(frames, tag, odometry=recording.odometry, max_frames=MAX_IMAGES)
+    try:
+        found = body_sightings(frames, tag, odometry=recording.odometry, max_frames=MAX_IMAGES)
+    except TagError as error:
+        raise TruthError(f"{what}: tripod tag {tag.id}: {error.message}", hint=error.hint) from error
     if not found.sightings:
         raise TruthError(
             f"{what}: tripod tag {tag.id} ({tag.family}) is never seen: {found.explanation}",

@@ -27,7 +27,7 @@ def test_prior_is_the_start_tag_and_odometry_to_the_beginning_of_the_visit(rng: 
     prior = prior_of(robot)
     position, angle = pose_error(prior.map_from_body, robot.map_from_body_at_visit)
     assert position < 0.01
-    assert angle < math.radians(0.2)
+    assert angle < math.radians(0.4)
     assert (prior.visit, prior.t_ns, prior.n_sightings) == ("w01", 14 * SECOND, 6)
     assert prior.travelled_m == pytest.approx(math.hypot(3, 2), rel=0.1)
 
@@ -138,6 +138,9 @@ def test_what_is_missing_is_named(rng: np.random.Generator) -> None:
         estimate_prior(unseen, visit, robot.tags, noise=NOISE)
     with pytest.raises(PriorError, match="no start before it"):
         estimate_prior(dataclasses.replace(recording, starts=()), visit, robot.tags, noise=NOISE)
+    resized = tuple(dataclasses.replace(f, camera=f.camera.scaled(0.5)) for f in recording.frames)
+    with pytest.raises(PriorError, match="start tag 1: image of 640x480 pixels with a camera of 320x240"):
+        estimate_prior(dataclasses.replace(recording, frames=resized), visit, robot.tags, noise=NOISE)
     no_arm = tuple(dataclasses.replace(f, body_from_cam=None) for f in recording.frames)
     with pytest.raises(PriorError, match="6 without a transform from body to camera"):
         estimate_prior(dataclasses.replace(recording, frames=no_arm), visit, robot.tags, noise=NOISE)

@@ -24,8 +24,8 @@ class TagSolution:
     """A tag's pose in the camera with its 6x6 covariance, and the other solution of the planar problem.
 
     ``ambiguity`` is the residual of the better solution over that of the other one, 0..1: above 0.2 the choice is
-    suspect, at 1 the image cannot tell them apart. Without another solution it is 0, or 1 where the tilt is so uncertain
-    that both have merged. Residuals are root mean squares per coordinate, in pixels.
+    suspect, at 1 the image cannot tell them apart. Without another solution it is 0, or 1 where the tilt is so
+    uncertain that both have merged. Residuals are root mean squares per coordinate, in pixels.
     """
 
     cam_from_tag: Pose
