@@ -83,11 +83,15 @@ def _extent(views: list[DepthView], rays: Array, max_depth_m: float) -> tuple[Ar
             corners = map_from_cam.apply(np.concatenate([[[0.0, 0.0, 0.0]], rays * float(valid.max()) / 1000.0]))
             low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
     if not np.isfinite(low).all():
-        raise SurfaceError("no depth image has a valid depth", hint="depth is 16-bit PNG in mm along the optical axis, 0 = none")
+        raise SurfaceError(
+            "no depth image has a valid depth", hint="depth is 16-bit PNG in mm along the optical axis, 0 = none"
+        )
     return low, high
 
 
-def _frustum_box(map_from_cam: Pose, rays: Array, reach_m: float, low: Array, voxel_m: float, shape: NDArray[np.int_]) -> NDArray[np.int64]:
+def _frustum_box(
+    map_from_cam: Pose, rays: Array, reach_m: float, low: Array, voxel_m: float, shape: NDArray[np.int_]
+) -> NDArray[np.int64]:
     """Return int64[2, 3]: the voxels from .. to that a view can reach."""
     corners = map_from_cam.apply(np.concatenate([[[0.0, 0.0, 0.0]], rays * reach_m]))
     first = np.floor((corners.min(axis=0) - low) / voxel_m).astype(np.int64)
@@ -126,12 +130,12 @@ def _integrate(  # type: ignore[no-untyped-def]
                     continue
                 x = (rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c + translation[0]) / z
                 y = (rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c + translation[1]) / z
-                column = int(math.floor((x - scale[0]) / scale[2] + 0.5))
-                row = int(math.floor((y - scale[1]) / scale[2] + 0.5))
+                column = math.floor((x - scale[0]) / scale[2] + 0.5)
+                row = math.floor((y - scale[1]) / scale[2] + 0.5)
                 if row < 0 or column < 0 or row >= rows or column >= columns:
                     continue
-                u = int(math.floor(lookup[row, column, 0]))
-                v = int(math.floor(lookup[row, column, 1]))
+                u = math.floor(lookup[row, column, 0])
+                v = math.floor(lookup[row, column, 1])
                 if u < 0 or v < 0 or u >= width or v >= height:
                     continue
                 measured = depth[v, u] * 0.001
@@ -151,10 +155,10 @@ def _mesh(distance: NDArray[np.float32], weight: NDArray[np.float32], low: Array
     seen = weight > 0
     if not seen.any() or not (distance[seen] < 0).any():
         raise SurfaceError("the depth images contain no surface", hint="check the depth camera and the poses")
-    # Marching cubes asks every corner of a cube to be seen; the mask marks cubes by their first corner.
+    # Only cubes whose eight corners were all seen have a surface; skimage's mask marks a cube by its last corner.
     corners = seen.copy()
     for axis in range(3):
-        corners &= np.roll(corners, -1, axis=axis)
+        corners &= np.roll(corners, 1, axis=axis)
     vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=corners, allow_degenerate=False)
     return Surface(low + voxel_m * vertices.astype(np.float64), faces.astype(np.int32), voxel_m)
 
@@ -176,10 +180,10 @@ def coarsen(surface: Surface, *, voxel_m: float) -> Surface:
 def write_ply(path: Path, surface: Surface) -> None:
     """Write a binary PLY (float32 vertices, int32 triangles)."""
     header = (
-        "ply\nformat binary_little_endian 1.0\ncomment voxel_m {:.9g}\n"
-        "element vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
-    ).format(surface.voxel_m, len(surface.vertices), len(surface.faces))
+        f"ply\nformat binary_little_endian 1.0\ncomment voxel_m {surface.voxel_m:.9g}\n"
+        f"element vertex {len(surface.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(surface.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
     faces = np.zeros(len(surface.faces), dtype=_FACE)
     faces["n"], faces["v"] = 3, surface.faces
     atomic_write(path, header.encode("ascii") + surface.vertices.astype("<f4").tobytes() + faces.tobytes())
@@ -197,7 +201,9 @@ def read_ply(path: Path) -> Surface:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise SurfaceError(f"{path}: cannot be read: {error.strerror}; expected a PLY mesh", hint="check the path") from error
+        raise SurfaceError(
+            f"{path}: cannot be read: {error.strerror}; expected a PLY mesh", hint="check the path"
+        ) from error
     own = _read_own_ply(content)
     return _read_foreign_ply(path) if own is None else own
 
@@ -213,7 +219,9 @@ def _read_own_ply(content: bytes) -> Surface | None:
         return None
     vertices = np.frombuffer(body, dtype="<f4", count=3 * n).reshape(-1, 3)
     faces = np.frombuffer(body, dtype=_FACE, count=m, offset=12 * n)["v"]
-    return Surface(vertices.astype(np.float64), np.ascontiguousarray(faces, dtype=np.int32), float(lines[2].split()[-1]))
+    return Surface(
+        vertices.astype(np.float64), np.ascontiguousarray(faces, dtype=np.int32), float(lines[2].split()[-1])
+    )
 
 
 def _read_foreign_ply(path: Path) -> Surface:
@@ -240,7 +248,7 @@ class RayCaster:
         TriangleMesh(self._scene, surface.vertices.astype(np.float32), surface.faces.astype(np.int32))
 
     def hit_distance(self, origins: ArrayLike, directions: ArrayLike) -> Array:
-        """Return the distance (m) to the first triangle along unit directions (n, 3) from origins (n, 3); inf if none."""
+        """Return the distance (m) from origins (n, 3) along unit directions (n, 3) to the first triangle, or inf."""
         start = np.ascontiguousarray(origins, dtype=np.float32)
         towards = np.ascontiguousarray(directions, dtype=np.float32)
         distance = np.full(len(start), np.inf)

@@ -95,8 +95,15 @@ def working_factor(shape: tuple[int, ...], *, max_side_px: int | None) -> float:
 
 def to_grey(image: Image) -> Image:
     """Return uint8[h, w] of a grey or RGB image; raises FeatureError for any other array."""
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.size == 0 or (image.ndim == 3 and image.shape[2] != 3):
-        raise FeatureError(f"image is {image.dtype}{list(image.shape)}; expected uint8[h, w] grey or uint8[h, w, 3] RGB")
+    if (
+        image.dtype != np.uint8
+        or image.ndim not in (2, 3)
+        or image.size == 0
+        or (image.ndim == 3 and image.shape[2] != 3)
+    ):
+        raise FeatureError(
+            f"image is {image.dtype}{list(image.shape)}; expected uint8[h, w] grey or uint8[h, w, 3] RGB"
+        )
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return np.ascontiguousarray(grey, dtype=np.uint8)
 

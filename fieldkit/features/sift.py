@@ -42,4 +42,4 @@ def detect_sift(
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Turn SIFT histograms (n, 128) into 8-bit RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
-    return np.clip(np.rint(_SCALE * np.sqrt(descriptors / total)), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(_SCALE * np.sqrt(descriptors / total)), 0, 255), dtype=np.uint8)

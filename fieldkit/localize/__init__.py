@@ -31,7 +31,9 @@ class Localizer:
 
     def __init__(self, scene_map: SceneMap, rules: LocalizerRules | None = None, *, seed: int = 0) -> None:
         if not len(scene_map.xyz) or not len(scene_map.descriptors):
-            raise LocalizeError(f"{scene_map.path}: the map has no landmarks with descriptors", hint="build the map again")
+            raise LocalizeError(
+                f"{scene_map.path}: the map has no landmarks with descriptors", hint="build the map again"
+            )
         self._map = scene_map
         self._rules = LocalizerRules() if rules is None else rules
         self._seed = seed

@@ -19,7 +19,7 @@ _NOISE_PX = 1.0
 _CAUCHY_FACTOR = 0.6123
 # Share of the landmarks' variance that all landmarks in view have in common, because the same mapping images placed
 # them. Set on one synthesized room: normalised errors of photos and views are near 1 per degree of freedom with it.
-_SHARED = 0.5
+_SHARED = 0.2
 _MIN_DEPTH_M = 0.05
 
 
@@ -100,17 +100,24 @@ def refine_pose(points: PosedPoints, map_from_cam: Pose, *, iterations: int = 20
 def shared_covariance(points: PosedPoints, map_from_cam: Pose) -> Array:
     """Return the 6x6 covariance of what no number of matches averages out: the error that nearby landmarks share.
 
-    The landmarks in view are taken to be displaced together by half of their (harmonic mean) variance, and turned
-    about the camera by that displacement at their median distance.
+    The landmarks in view are taken to be displaced together by a share of their mean variance, and turned about the
+    camera by that displacement at their median distance.
     """
-    mean_information = np.linalg.inv(points.xyz_covariance).mean(axis=0)
-    displacement = _SHARED * np.linalg.inv(mean_information)
+    displacement = _SHARED * log_mean(points.xyz_covariance)
     rotation = map_from_cam.rotation.as_matrix()
     distance = float(np.median(np.linalg.norm(points.xyz - map_from_cam.translation, axis=1)))
     result = np.zeros((6, 6))
     result[:3, :3] = np.eye(3) * np.trace(displacement) / 3.0 / max(distance, _MIN_DEPTH_M) ** 2
     result[3:, 3:] = rotation.T @ displacement @ rotation
     return 0.5 * (result + result.T)
+
+
+def log_mean(covariances: Array) -> Array:
+    """Return the log-Euclidean mean (3, 3) of covariances (n, 3, 3): no single landmark rules it."""
+    values, vectors = np.linalg.eigh(covariances)
+    logs = np.einsum("nij,nj,nkj->nik", vectors, np.log(np.maximum(values, 1e-12)), vectors)
+    mean_values, mean_vectors = np.linalg.eigh(logs.mean(axis=0))
+    return np.asarray((mean_vectors * np.exp(mean_values)) @ mean_vectors.T)
 
 
 def _residuals(points: PosedPoints, map_from_cam: Pose) -> tuple[Array, Array]:

@@ -19,6 +19,8 @@ Verdict = Literal["pass", "warn", "fail"]
 # Below this no camera is called an outlier, however well the others fit: SLAM and SfM both are that uncertain.
 _MIN_THRESHOLD_M = 0.05
 _MIN_POSES = 3
+# Threshold in median residuals: a steady drift is kept whole, positions that are plainly wrong are left out.
+_WIDTH = 4.0
 # Tilt between SLAM's up and the map's that is levelled; more means that one of the two is wrong.
 _MAX_LEVELLED_DEG = 5.0
 
@@ -38,7 +40,8 @@ class Similarity:
     def pose(self, b_from_c: Pose) -> Pose:
         """Map a pose: its origin moves with the points, its axes turn."""
         return Pose.from_components(
-            self.points(b_from_c.translation[None])[0], Rotation.from_matrix((self.rotation * b_from_c.rotation).as_matrix())
+            self.points(b_from_c.translation[None])[0],
+            Rotation.from_matrix((self.rotation * b_from_c.rotation).as_matrix()),
         )
 
 
@@ -78,9 +81,9 @@ def umeyama(source: Array, target: Array) -> Similarity:
 def robust_similarity(source: Array, target: Array, *, rng: np.random.Generator) -> tuple[Similarity, float]:
     """Fit a similarity of which less than half of the points (n, 3) may be wrong; return it and its threshold (m).
 
-    Starts from the least median of residuals over random triples and then fits to all points within 2.5 times the
-    median residual of those kept, but at least 0.05 m: a drifting trajectory widens its own threshold, where a fixed
-    one would throw most of it away.
+    Starts from the least median of residuals over random triples and then fits to all points within four times the
+    median residual, but at least 0.05 m: a drifting trajectory widens its own threshold, where a fixed one would
+    throw most of it away.
     """
     best, lowest = umeyama(source, target), np.inf
     for _ in range(500):
@@ -91,17 +94,16 @@ def robust_similarity(source: Array, target: Array, *, rng: np.random.Generator)
         median = float(np.median(np.linalg.norm(trial.points(source) - target, axis=1)))
         if median < lowest:
             best, lowest = trial, median
-    residual = np.linalg.norm(best.points(source) - target, axis=1)
-    threshold = max(2.5 * lowest, _MIN_THRESHOLD_M)
-    kept = residual <= max(threshold, float(np.partition(residual, 2)[2]))
-    for _ in range(20):
-        best = umeyama(source[kept], target[kept])
-        residual = np.linalg.norm(best.points(source) - target, axis=1)
-        threshold = max(2.5 * float(np.median(residual[kept])), _MIN_THRESHOLD_M)
-        now = residual <= threshold
-        if now.sum() < _MIN_POSES or (now == kept).all():
+    threshold = max(2.0 * _WIDTH * lowest, _MIN_THRESHOLD_M)
+    kept = np.zeros(len(source), dtype=bool)
+    for _ in range(30):
+        now = np.linalg.norm(best.points(source) - target, axis=1) <= threshold
+        if (now == kept).all() or now.sum() < _MIN_POSES:
             break
         kept = now
+        best = umeyama(source[kept], target[kept])
+        residual = np.linalg.norm(best.points(source) - target, axis=1)
+        threshold = max(_WIDTH * float(np.median(residual)), _MIN_THRESHOLD_M)
     return best, threshold
 
 

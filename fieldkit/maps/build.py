@@ -20,8 +20,8 @@ from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import AlignmentEntry, MapFile, SurfaceEntry, content_digest, write_features, write_map_file
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
 from fieldkit.maps.pairs import choose_pairs, match_pairs
-from fieldkit.maps.sfm import reconstruct, threads
 from fieldkit.maps.rigs import contradicting
+from fieldkit.maps.sfm import reconstruct, threads
 from fieldkit.maps.source import DepthFrame, MapSource, read_source
 from fieldkit.store import atomic_folder
 from fieldkit.store.files import refuse_existing
@@ -41,7 +41,7 @@ class MapOptions:
     n_similar: int = 20
     n_neighbours: int = 3
     min_registered: float = 0.5
-    landmarks: LandmarkRules = LandmarkRules()
+    landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
@@ -149,9 +149,7 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
                 f"{image.camera.width}x{image.camera.height}",
                 hint="give every camera images of one size",
             )
-        return extract(
-            grey, feature=feature, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
-        )
+        return extract(grey, feature=feature, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size)
 
     found = []
     with ThreadPoolExecutor(threads()) as pool:
@@ -186,8 +184,8 @@ def _align(walk: MapSource, sfm_poses: Mapping[int, Pose], seed: int) -> tuple[A
         warnings.append(f"{len(sfm_poses)} of {len(walk.images)} images registered")
     if alignment.verdict != "pass":
         warnings.append(
-            f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} SLAM positions fit within "
-            f"{alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
+            f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} SLAM positions fit "
+            f"within {alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
         )
     return alignment, warnings
 
@@ -197,7 +195,9 @@ def _finish_model(
 ) -> int:
     """Bring the model into the map frame and take out points that are no landmarks; return how many are left."""
     model.transform(
-        pycolmap.Sim3d(map_from_sfm.scale, pycolmap.Rotation3d(map_from_sfm.rotation.as_quat()), map_from_sfm.translation)
+        pycolmap.Sim3d(
+            map_from_sfm.scale, pycolmap.Rotation3d(map_from_sfm.rotation.as_quat()), map_from_sfm.translation
+        )
     )
     arrays = model_arrays(model)
     good = good_landmarks(arrays, rules)

@@ -13,9 +13,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from fieldkit.errors import MapError
+from fieldkit.errors import MapError, suggestion
 from fieldkit.features import FEATURES, Features
-from fieldkit.errors import suggestion
 from fieldkit.maps.landmarks import landmark_covariance, model_arrays
 from fieldkit.maps.sfm import quiet_colmap
 from fieldkit.store import digest, read_toml, write_toml
@@ -59,7 +58,9 @@ class MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     surface: SurfaceEntry | None = None
 
 
-def write_features(path: Path, features: Mapping[str, Features], sizes: Mapping[str, tuple[int, int]], *, compress: bool = False) -> None:
+def write_features(
+    path: Path, features: Mapping[str, Features], sizes: Mapping[str, tuple[int, int]], *, compress: bool = False
+) -> None:
     """Write features.h5 in hloc's layout: per image name keypoints (n, 2) without COLMAP's half pixel,
     descriptors (w, n), scores (n,) and image_size (2,) = width, height."""
     options: dict[str, Any] = {"compression": "gzip", "compression_opts": 9, "shuffle": True} if compress else {}
@@ -84,17 +85,21 @@ def read_features(path: Path, names: tuple[str, ...]) -> dict[str, tuple[NDArray
         with h5py.File(path, "r") as file:
             for name in names:
                 if name not in file:
-                    raise MapError(f"{path}: no features of {name}", hint="the file belongs to another map; build the map again")
+                    raise MapError(
+                        f"{path}: no features of {name}", hint="the file belongs to another map; build the map again"
+                    )
                 keypoints = np.asarray(file[name]["keypoints"], dtype=np.float32) + np.float32(0.5)
                 descriptors = np.asarray(file[name]["descriptors"])
                 if descriptors.ndim != 2 or descriptors.shape[1] != len(keypoints):
                     raise MapError(
-                        f"{path}: {name} has {len(keypoints)} keypoints and descriptors {descriptors.shape}; expected (w, n)",
+                        f"{path}: {name}: {len(keypoints)} keypoints, descriptors {descriptors.shape}; expected (w, n)",
                         hint="build the map again",
                     )
                 result[name] = keypoints, np.ascontiguousarray(descriptors.T)
     except (OSError, KeyError) as error:
-        raise MapError(f"{path}: cannot be read: {error}; expected features as hloc writes them", hint="build the map again") from error
+        raise MapError(
+            f"{path}: cannot be read: {error}; expected features as hloc writes them", hint="build the map again"
+        ) from error
     return result
 
 
@@ -121,20 +126,24 @@ def read_map_file(path: Path) -> MapFile:
 def load_map(path: Path) -> SceneMap:
     """Load a map folder: landmarks with covariance, who saw them, their descriptors, and the surface if it has one.
 
-    Raises MapError when a file is missing or damaged, or the map's feature is unknown here.
+    Raises MapError when a file is missing, damaged or changed, or the map's feature is unknown here.
     """
     path = Path(path)
     entry = read_map_file(path)
     if entry.feature not in FEATURES:
         raise MapError(f"{path}: built with feature {entry.feature!r}", hint=suggestion(entry.feature, list(FEATURES)))
+    _refuse_changed(path, entry)
     model = model_arrays(read_model(path / "sparse"))
     stored = read_features(path / "features.h5", model.image_names)
-    rows = [stored[name][1][model.observation_keypoint[model.observation_image == i]] for i, name in enumerate(model.image_names)]
+    rows = [
+        stored[name][1][model.observation_keypoint[model.observation_image == i]]
+        for i, name in enumerate(model.image_names)
+    ]
     width = FEATURES[entry.feature].width
     descriptors = np.concatenate(rows) if rows else np.zeros((0, width), dtype=np.uint8)
     if descriptors.shape[1] != width:
         raise MapError(
-            f"{path / 'features.h5'}: descriptors are {descriptors.shape[1]} wide; expected {width} of {entry.feature!r}",
+            f"{path / 'features.h5'}: descriptors of width {descriptors.shape[1]}; {entry.feature!r} has {width}",
             hint="the file belongs to another feature",
         )
     # A compact map keeps one descriptor per landmark; the others are zero.
@@ -160,20 +169,38 @@ def load_map(path: Path) -> SceneMap:
     )
 
 
+def _refuse_changed(path: Path, entry: MapFile) -> None:
+    """Raise MapError when files are missing or are not those that map.toml's digest was made of.
+
+    COLMAP may read a cut-off model without an error, and results name the digest as what they were made with.
+    """
+    needed = [path / "sparse" / "images.bin", path / "sparse" / "points3D.bin", path / "features.h5"]
+    if entry.surface is not None:
+        needed.append(path / entry.surface.file)
+    for file in needed:
+        if not file.is_file():
+            raise MapError(f"{file}: no such file; expected a whole map folder", hint="copy or build the map again")
+    if content_digest(path) != entry.digest:
+        raise MapError(
+            f"{path}: its files have another digest than map.toml names ({entry.digest}); they are damaged or changed",
+            hint="copy or build the map again",
+        )
+
+
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model (binary or text); raises MapError when it is missing or damaged."""
     try:
         with quiet_colmap():
             return pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, OSError) as error:
-        raise MapError(f"{folder}: no readable COLMAP model; expected {', '.join(_MODEL_FILES)}", hint="build the map again") from error
+    except (ValueError, RuntimeError, OSError, LookupError) as error:
+        raise MapError(
+            f"{folder}: no readable COLMAP model; expected {', '.join(_MODEL_FILES)}", hint="build the map again"
+        ) from error
 
 
 def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
     if entry is None:
         return None
-    if not (path / entry.file).is_file():
-        raise MapError(f"{path / entry.file}: no such file; map.toml names it as the surface", hint="build the map again")
     return dataclasses.replace(read_ply(path / entry.file), voxel_m=entry.voxel_m)
 
 

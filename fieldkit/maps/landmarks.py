@@ -161,9 +161,7 @@ def landmark_covariance(
     information = np.tile(np.eye(3) / prior_m**2, (len(xyz), 1, 1))
     for i, rows in _by_image(observation_image, len(map_from_image)):
         jacobian = projection_jacobian(xyz[observation_landmark[rows]], map_from_image[i], image_cameras[i])
-        np.add.at(
-            information, observation_landmark[rows], np.einsum("nki,nkj->nij", jacobian, jacobian) / noise_px**2
-        )
+        np.add.at(information, observation_landmark[rows], np.einsum("nki,nkj->nij", jacobian, jacobian) / noise_px**2)
     return np.asarray(np.linalg.inv(information))
 
 

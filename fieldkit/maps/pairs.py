@@ -17,7 +17,12 @@ Pair = tuple[int, int]
 
 
 def choose_pairs(
-    images: Sequence[SourceImage], features: Sequence[Features], *, seed: int, n_similar: int = 20, n_neighbours: int = 3
+    images: Sequence[SourceImage],
+    features: Sequence[Features],
+    *,
+    seed: int,
+    n_similar: int = 20,
+    n_neighbours: int = 3,
 ) -> list[Pair]:
     """Choose image pairs (i < j): the most similar by global descriptor, and neighbours in the sequence.
 

@@ -126,7 +126,7 @@ def _refuse_duplicates(path: Path, images: list[SourceImage]) -> None:
     for image in images:
         if image.frame in seen:
             raise MapError(
-                f"{path / 'images'}: {seen[image.frame]} and {image.name} have the same name; expected one file per name",
+                f"{path / 'images'}: {seen[image.frame]} and {image.name} have one name; expected one file each",
                 hint="rename one of them",
             )
         seen[image.frame] = image.name
