@@ -198,7 +198,7 @@ def _find_tags(
     seen: set[int] = set()
     for number, photo in enumerate(listed):
         if progress is not None:
-            progress("find tags", number, len(listed))
+            progress("find tags", number + 1, len(listed))
         image = _read_photo(photo)
         found = [] if image is None else detect(image, photo.camera, families=families)
         if not found:
@@ -244,7 +244,7 @@ def _localize(
     failed: list[TagPhoto] = []
     for number, shot in enumerate(shots):
         if progress is not None:
-            progress("localize photos", number, len(shots))
+            progress("localize photos", number + 1, len(shots))
         image = _read_photo(shot.photo)
         assert image is not None
         covered = _without_tags(image, shot.found)
