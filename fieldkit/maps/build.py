@@ -184,8 +184,8 @@ def _align(walk: MapSource, sfm_poses: Mapping[int, Pose], seed: int) -> tuple[A
         warnings.append(f"{len(sfm_poses)} of {len(walk.images)} images registered")
     if alignment.verdict != "pass":
         warnings.append(
-            f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} SLAM positions fit "
-            f"within {alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
+            f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} SLAM poses within "
+            f"{alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
         )
     return alignment, warnings
 
