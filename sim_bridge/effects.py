@@ -14,8 +14,10 @@ def add_noise(image: Image, *, sigma: float, rng: np.random.Generator) -> Image:
     if sigma <= 0.0:
         return image
     noise = rng.standard_normal(image.shape[:2], dtype=np.float32) * np.float32(sigma)
-    shifted = image.astype(np.float32) + (noise if image.ndim == 2 else noise[:, :, None])
-    return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)
+    levels = np.rint(noise).astype(np.int16)
+    shift = levels if image.ndim == 2 else cv2.merge([levels] * 3)
+    result: Image = cv2.add(image, shift, dtype=cv2.CV_8U)
+    return result
 
 
 def grey(rgb: Image) -> Image:

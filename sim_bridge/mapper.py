@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -79,7 +80,7 @@ def _mounted(position_m: tuple[float, float, float], yaw_deg: float, *, pitch_de
 def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tuple[Station, ...]:
     """Walk along the scene's loop and return the stations, evenly spaced, with natural bob and turning of the head.
 
-    SLAM's frame starts below the first station, z up. Raises nothing; the loop is the scene's own.
+    SLAM's frame starts below the first station, z up.
     """
     path, tangent = _smooth_loop(scene, step_m=LOOP_STEP_M)
     count, phase = options.stations, rng.uniform(0.0, 2 * np.pi, 4)
@@ -110,14 +111,14 @@ def _places(length: int, heading: Array, options: WalkOptions) -> tuple[NDArray[
     effort = np.concatenate([[0.0], np.cumsum(LOOP_STEP_M + turned * (1.5 / (np.pi / 2)))])
     wanted = np.linspace(0.0, effort[-1], options.stations, endpoint=False)
     place = np.searchsorted(effort, wanted)
-    return rest[place], place * LOOP_STEP_M
+    return rest[place].astype(np.intp), place.astype(np.float64) * LOOP_STEP_M
 
 
 def _smooth_loop(scene: Scene, *, step_m: float) -> tuple[Array, Array]:
     """Return the scene's loop as points (n, 2), rounded as far as the free floor allows, and its heading (n,)."""
     corners = np.vstack([scene.walk_xy, scene.walk_xy[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    count = max(int(round(along[-1] / step_m)), 8)
+    count = max(round(along[-1] / step_m), 8)
     at = np.linspace(0.0, along[-1], count, endpoint=False)
     sharp = np.column_stack([np.interp(at, along, corners[:, k]) for k in range(2)])
     path = sharp
@@ -147,7 +148,7 @@ def drifting(poses: tuple[Pose, ...], options: WalkOptions, *, rng: np.random.Ge
     slam_from_world = Pose.from_components([*first.translation[:2], 0.0], turn(yaw0)).inv()
     error_yaw, error_xyz = 0.0, np.zeros(3)
     result = [slam_from_world * first]
-    for before, after in zip(poses, poses[1:], strict=False):
+    for before, after in itertools.pairwise(poses):
         root = np.sqrt(float(np.linalg.norm(after.translation - before.translation)))
         error_yaw += np.radians(options.drift_yaw_deg) * root * rng.standard_normal()
         step = slam_from_world.rotation.apply(after.translation - before.translation)

@@ -30,9 +30,7 @@ class OdometryOptions:
     origin_yaw_deg: float = 35.0
 
 
-def drifting_odometry(
-    world_from_body: list[Pose], options: OdometryOptions, *, rng: np.random.Generator
-) -> list[Pose]:
+def drifting_odometry(world_from_body: list[Pose], options: OdometryOptions, *, rng: np.random.Generator) -> list[Pose]:
     """Return odom_from_body for true poses of a body that moves upright on a floor.
 
     The odometry frame stands where ``options`` says, not at the robot: nothing may rely on a start at zero. Errors

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from sim_bridge.errors import SynthesisError
@@ -27,7 +27,7 @@ class FloorGraph:
     """Free floor as a graph: centres (n, 2) in m of the free cells, and the cost of steps to neighbouring ones."""
 
     centres: Array
-    steps: coo_array
+    steps: csr_array
 
     def nearest(self, xy: ArrayLike) -> int:
         """Return the index of the free cell nearest to a point (2,)."""
@@ -42,7 +42,7 @@ class FloorGraph:
 
 
 def floor_graph(scene: Scene, radius_m: float) -> FloorGraph:
-    """Return the graph of the floor on which a disc of this radius is free; raises SynthesisError when there is none."""
+    """Return the graph of the floor where a disc of this radius is free; raises SynthesisError when there is none."""
     x0, y0, x1, y1 = scene.floor_bounds
     xs, ys = np.arange(x0 + CELL_M / 2, x1, CELL_M), np.arange(y0 + CELL_M / 2, y1, CELL_M)
     grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1)
@@ -63,7 +63,7 @@ def floor_graph(scene: Scene, radius_m: float) -> FloorGraph:
         costs.append(np.hypot(dx, dy) * CELL_M * 0.5 * (price[a][both] + price[b][both]))
     count = int(free.sum())
     steps = coo_array((np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=(count, count))
-    return FloorGraph(grid[free], steps)
+    return FloorGraph(grid[free], csr_array(steps))
 
 
 def plan_path(scene: Scene, graph: FloorGraph, ends_xy: tuple[ArrayLike, ArrayLike], *, radius_m: float) -> Array:
@@ -73,7 +73,7 @@ def plan_path(scene: Scene, graph: FloorGraph, ends_xy: tuple[ArrayLike, ArrayLi
     """
     start, goal = (np.asarray(end, dtype=np.float64) for end in ends_xy)
     first, last = graph.nearest(start), graph.nearest(goal)
-    cost, previous = dijkstra(graph.steps.tocsr(), directed=False, indices=first, return_predecessors=True)
+    cost, previous = dijkstra(graph.steps, directed=False, indices=np.array(first), return_predecessors=True)
     if not np.isfinite(cost[last]):
         raise SynthesisError(
             f"no free path from {start.round(2).tolist()} to {goal.round(2).tolist()} for a robot of radius "
@@ -180,7 +180,7 @@ class TrackBuilder:
     def follow(self, values: Array, *, seconds: float) -> None:
         """Go through rows (n, k) in a time, evenly spaced in progress, smoothly starting and stopping."""
         begin = self.t_s
-        steps = max(int(round(seconds * 50)), 2)
+        steps = max(round(seconds * 50), 2)
         progress = np.linspace(0.0, 1.0, len(values))
         for i in range(1, steps + 1):
             u = i / steps

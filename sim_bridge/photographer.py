@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 # 12 megapixels, 69 deg wide, with the barrel distortion of an ordinary zoom lens.
 PHOTO_CAMERA = Camera("OPENCV", 4000, 3000, (2905.4, 2903.1, 2012.3, 1489.6, -0.105, 0.062, 0.0007, -0.0005))
 CAMERA_FILE = "camera.toml"
+# Viewpoints that are proposed in each sector before a tag.
+TRIES = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,19 +81,16 @@ def _viewpoints(
 ) -> list[Pose]:
     """Choose viewpoints from left to right of a tag; in each sector the one that shows most of the surroundings."""
     edges = np.linspace(-options.slant_deg, options.slant_deg, count + 1)
-    sectors: list[list[Pose]] = []
-    for low, high in zip(edges, edges[1:], strict=False):
-        found = [_try(scene, tag, (low, high), options, rng=rng) for _ in range(40)]
-        ranked = sorted(
-            (pose for pose in found if pose is not None), key=lambda pose: -richness(scene, pose)
-        )
-        sectors.append(ranked)
-    chosen = [sector[0] for sector in sectors if sector]
-    # A sector that furniture blocks leaves its photo to the others.
-    for rank in range(1, 40):
-        for sector in sectors:
-            if len(chosen) < count and rank < len(sector):
-                chosen.append(sector[rank])
+    sectors: list[list[tuple[int, Pose]]] = []
+    for sector in itertools.pairwise(edges):
+        found = [_try(scene, tag, sector, options, rng=rng) for _ in range(TRIES)]
+        shown = [(richness(scene, pose), pose) for pose in found if pose is not None]
+        sectors.append(sorted(shown, key=lambda item: -item[0]))
+    # A sector that furniture blocks, or that shows a bare wall, leaves its photo to the others.
+    enough = 0.4 * max((sector[0][0] for sector in sectors if sector), default=0)
+    ranked = [sector[rank] for rank in range(TRIES) for sector in sectors if rank < len(sector)]
+    ranked.sort(key=lambda item: item[0] < enough)
+    chosen = [pose for _, pose in ranked[:count]]
     if len(chosen) < count:
         raise SynthesisError(
             f"only {len(chosen)} places from which tag {tag.id} can be photographed; expected {count}",

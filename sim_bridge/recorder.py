@@ -35,7 +35,7 @@ class RecorderOptions:
     encoder_deg: float = 0.02
     noise_sigma: float = 2.0
     jpeg_quality: int = 90
-    odometry: OdometryOptions = OdometryOptions()
+    odometry: OdometryOptions = dataclasses.field(default_factory=OdometryOptions)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,14 +53,14 @@ class Sensed:
 
     images: tuple[SensedImage, ...]
     odometry: tuple[tuple[int, Pose], ...]
-    joints: tuple[tuple[int, robot.ArmJoints], ...]
+    links: tuple[tuple[int, list[tuple[str, str, Pose]]], ...]
     events: tuple[tuple[int, dict[str, Any]], ...]
     world_from_body: tuple[tuple[int, Pose], ...]
 
 
 def stamp(t_s: float) -> int:
     """Return the header stamp of a time since the session's begin."""
-    return BEGIN_NS + int(round(t_s * 1e9))
+    return BEGIN_NS + round(t_s * 1e9)
 
 
 def sense(stage: Stage, schedule: Schedule, options: RecorderOptions, *, rng: np.random.Generator) -> Sensed:
@@ -72,10 +72,11 @@ def sense(stage: Stage, schedule: Schedule, options: RecorderOptions, *, rng: np
     true_body = [schedule.world_from_body(float(t)) for t in odometry_s]
     believed = drifting_odometry(true_body, options.odometry, rng=rng)
     stamps = [stamp(float(t)) for t in odometry_s]
-    joints = []
+    links = []
     for t in _clock(schedule.end_s, options, rng=rng):
         noise = np.radians(options.encoder_deg) * rng.standard_normal(4)
-        joints.append((stamp(float(t)), robot.joints(schedule.joints(float(t)).as_array() + noise)))
+        measured = robot.joints(schedule.joints(float(t)).as_array() + noise)
+        links.append((stamp(float(t)), robot.moving_links(measured)))
     images, events = [], [(stamp(t), event) for t, event in schedule.events]
     for shot in sorted(schedule.shots, key=lambda shot: shot.t_s):
         world_from_cam = schedule.world_from_body(shot.t_s) * robot.body_from_camera(schedule.joints(shot.t_s))
@@ -89,7 +90,7 @@ def sense(stage: Stage, schedule: Schedule, options: RecorderOptions, *, rng: np
     return Sensed(
         tuple(images),
         tuple(zip(stamps, believed, strict=True)),
-        tuple(joints),
+        tuple(links),
         tuple(sorted(events, key=lambda item: item[0])),
         tuple(zip(stamps, true_body, strict=True)),
     )
@@ -108,8 +109,8 @@ def write_recording(path: Path, sensed: Sensed, *, format: BagFormat, layout: st
         queue: list[tuple[int, int, Callable[[], None]]] = []
         for t_ns, pose in sensed.odometry:
             queue.append((t_ns, 0, _call(writer.odometry, t_ns, pose)))
-        for t_ns, arm in sensed.joints:
-            queue.append((t_ns, 1, _call(writer.tf, t_ns, robot.moving_links(arm))))
+        for t_ns, links in sensed.links:
+            queue.append((t_ns, 1, _call(writer.tf, t_ns, links)))
         for image in sensed.images:
             queue.append((image.t_ns, 2, _call(writer.camera_info, image.t_ns, robot.ARM_CAMERA)))
             queue.append((image.t_ns, 3, _call(writer.image, image.t_ns, image.jpeg)))

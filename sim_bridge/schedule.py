@@ -12,7 +12,7 @@ from fieldkit.frames import Pose
 from fieldkit.types import ViewKind
 from sim_bridge import robot
 from sim_bridge.paths import SPACING_M, Track, TrackBuilder, floor_graph, headings, plan_path
-from sim_bridge.staging import Stage, StageOptions, Waypoint, looking_at
+from sim_bridge.staging import Stage, StageOptions, Waypoint, clear_around, looking_at
 
 Array = NDArray[np.float64]
 
@@ -183,9 +183,18 @@ class _Planner:
         seconds = 1.5 * len(path) * SPACING_M / self._options.speed_m_s
         self._body.follow(np.column_stack([path, yaws]), seconds=seconds)
         self._arm.hold_until(self._now)
-        for k in range(self._options.drive_images):
-            self._shots.append(Shot(begin + seconds * (k + self._rng.uniform(0.3, 0.7)) / self._options.drive_images))
+        self._shoot_while_driving(begin, seconds)
         self._turn_body(goal[2] + 2 * np.pi * np.round((yaws[-1] - goal[2]) / (2 * np.pi)))
+
+    def _shoot_while_driving(self, begin_s: float, seconds: float) -> None:
+        """Take a few images on the way, where the stowed hand, ahead of the body, does not reach over furniture."""
+        count, track = self._options.drive_images, self._body.build()
+        for k in range(count):
+            t_s = begin_s + seconds * (k + self._rng.uniform(0.3, 0.7)) / count
+            x, y, yaw = track.at(t_s)[0]
+            hand = (robot.standing([x, y], yaw) * robot.body_from_camera(robot.STOWED)).translation
+            if clear_around(self._stage.scene, hand, radius_m=0.1):
+                self._shots.append(Shot(t_s))
 
     def _turn_body(self, yaw: float) -> None:
         x, y, before = self._body.values

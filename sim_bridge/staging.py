@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 FAMILY = "tag36h11"
 # White margin around the black square, in cells of the tag (the square has 8), and the board that carries the print.
 MARGIN_CELLS = 1
+# Places for the start tag that are looked at before the richest is taken.
+PLACES_SEEN = 20
 BOARD_M, BOARD_THICKNESS_M, POLE_M = 0.19, 0.006, 0.025
 # A quick look that tells how much there is to see around a tag.
 _GLANCE = Camera("PINHOLE", 320, 240, (230.0, 230.0, 160.0, 120.0))
@@ -159,24 +161,35 @@ def _place_start(scene: Scene, options: StageOptions, *, rng: np.random.Generato
     """Hang the start tag where the wall is bare and flat and the view of it, wall and room, is the richest."""
     graph = floor_graph(scene, options.drive_radius_m)
     best: tuple[int, PlacedTag, Pose] | None = None
+    seen = 0
     for place in _bare_walls(scene, rng=rng):
         tag = PlacedTag(options.start_tag_id, options.tag_size_m, place)
         body = _body_before(scene, graph, tag, options, rng=rng)
-        if body is None:
+        if body is None or not _room_for_photos(scene, tag):
             continue
         value = richness(scene, look_at(place.apply([0.5, 0.5, 1.3]), place.translation))
         value += richness(scene, look_at(place.apply([-0.5, 0.5, 1.3]), place.translation))
         if best is None or value > best[0]:
             best = (value, tag, body)
+        seen += 1
+        if seen == PLACES_SEEN:
+            break
     if best is None:
-        raise SynthesisError("the scene has no bare wall in front of which the robot can stand", hint="use another seed")
+        raise SynthesisError(
+            "the scene has no bare wall in front of which the robot can stand", hint="use another seed"
+        )
     return best[1], best[2]
 
 
 def _bare_walls(scene: Scene, *, rng: np.random.Generator) -> list[Pose]:
-    """Return world_from_tag of places at 0.5..0.8 m height where the wall is flat, free, and a tag fits."""
+    """Return world_from_tag of places at 0.5..0.8 m height where the wall is flat, free, and a tag fits; shuffled."""
     x0, y0, x1, y1 = scene.floor_bounds
-    walls = [((x0, y0), (x1, y0), 90.0), ((x1, y0), (x1, y1), 180.0), ((x1, y1), (x0, y1), 270.0), ((x0, y1), (x0, y0), 0.0)]
+    walls = [
+        ((x0, y0), (x1, y0), 90.0),
+        ((x1, y0), (x1, y1), 180.0),
+        ((x1, y1), (x0, y1), 270.0),
+        ((x0, y1), (x0, y0), 0.0),
+    ]
     offsets = np.linspace(-0.13, 0.13, 7)
     places = []
     for start, end, yaw_deg in walls:
@@ -191,7 +204,7 @@ def _bare_walls(scene: Scene, *, rng: np.random.Generator) -> list[Pose]:
             # Rays that miss the wall have no depth.
             if np.isfinite(depth).all() and np.ptp(depth) < 1e-3 and abs(float(depth[0]) - 0.7) < 0.05:
                 places.append(facing(frame.apply([0.0, 0.0, 0.7 - float(depth[0]) + 0.01]), np.radians(yaw_deg)))
-    return places
+    return [places[k] for k in rng.permutation(len(places))]
 
 
 def _body_before(
@@ -253,11 +266,9 @@ def _place_waypoint(stage: Stage, options: StageOptions, *, index: int, rng: np.
 
 
 def _sweep_is_clear(scene: Scene, body: Pose) -> bool:
-    for yaw in np.linspace(-np.pi, np.pi, 12, endpoint=False):
-        view = body * robot.body_from_camera(robot.looking(float(yaw), 0.0))
-        if not clear_around(scene, view.translation, radius_m=0.12):
-            return False
-    return True
+    arms = [robot.looking(float(yaw), 0.0) for yaw in np.linspace(-np.pi, np.pi, 12, endpoint=False)]
+    views = [body * robot.body_from_camera(arm) for arm in (robot.STOWED, *arms)]
+    return all(clear_around(scene, view.translation, radius_m=0.12) for view in views)
 
 
 def _with_tripod_near(
@@ -301,16 +312,15 @@ def _truth_arms(
         distance = float(np.linalg.norm(view.translation - tag.world_from_tag.translation))
         low, high = np.radians(options.truth_slant_deg)
         near = options.truth_distance_m[0] <= distance <= options.truth_distance_m[1]
-        good = near and low <= slant(view, tag) <= high
+        good = near and low <= slant(view, tag) <= high and clear_around(scene, view.translation, radius_m=0.1)
         if good and sees(scene, view, robot.ARM_CAMERA, tag, margin_px=25.0):
-            if clear_around(scene, view.translation, radius_m=0.1):
-                found.append(arm)
-                centres.append(view.translation)
+            found.append(arm)
+            centres.append(view.translation)
         if trial == 30 and not found:
             return ()
     chosen: list[int] = []
     while len(chosen) < min(options.truth_sightings, len(found)):
-        gaps = [np.inf if not chosen else min(np.linalg.norm(c - centres[k]) for k in chosen) for c in centres]
+        gaps = [min((float(np.linalg.norm(c - centres[k])) for k in chosen), default=np.inf) for c in centres]
         chosen.append(int(np.argmax([-1.0 if k in chosen else gap for k, gap in enumerate(gaps)])))
     return tuple(found[k] for k in chosen)
 

@@ -33,11 +33,11 @@ from sim_bridge.scene import SCENES, Scene
 class SessionOptions:
     """What a session is made of."""
 
-    walk: mapper.WalkOptions = mapper.WalkOptions()
-    stage: staging.StageOptions = staging.StageOptions()
-    photos: photographer.PhotoOptions = photographer.PhotoOptions()
-    schedule: schedule.ScheduleOptions = schedule.ScheduleOptions()
-    recorder: recorder.RecorderOptions = recorder.RecorderOptions()
+    walk: mapper.WalkOptions = dataclasses.field(default_factory=mapper.WalkOptions)
+    stage: staging.StageOptions = dataclasses.field(default_factory=staging.StageOptions)
+    photos: photographer.PhotoOptions = dataclasses.field(default_factory=photographer.PhotoOptions)
+    schedule: schedule.ScheduleOptions = dataclasses.field(default_factory=schedule.ScheduleOptions)
+    recorder: recorder.RecorderOptions = dataclasses.field(default_factory=recorder.RecorderOptions)
 
 
 def synthesize(
@@ -57,10 +57,14 @@ def synthesize(
     chosen, out = options or SessionOptions(), Path(out)
     if scene not in SCENES:
         raise SynthesisError(f"unknown scene {scene!r}", hint=suggestion(scene, list(SCENES)))
-    for name in formats or ("",):
-        if name not in recorder.RECORDINGS:
-            raise SynthesisError(f"unknown format {name!r}", hint=suggestion(name, list(recorder.RECORDINGS)))
+    for wanted in formats or ("none",):
+        if wanted not in recorder.RECORDINGS:
+            raise SynthesisError(f"unknown format {wanted!r}", hint=suggestion(wanted, list(recorder.RECORDINGS)))
+    if seed < 0:
+        raise SynthesisError(f"seed {seed}; expected 0 or more", hint="choose another seed")
     refuse_existing(out, force=force)
+    if out.exists() and not (out / "session.toml").exists() and any(out.iterdir() if out.is_dir() else [out]):
+        raise SynthesisError(f"{out}: not a session, so --force does not replace it", hint="choose another --out")
     room = SCENES[scene](seed)
     stage = staging.set_stage(room, chosen.stage, rng=generator(seed, 4))
     with atomic_folder(out, force=force) as folder:
@@ -69,8 +73,8 @@ def synthesize(
         _write_robot(folder, stage, chosen, formats, seed=seed)
         _write_surface(folder / "truth" / "surface.ply", room)
         _write_tags(folder / "truth" / "tags.toml", stage)
-        name = recorder.RECORDINGS[formats[0]]
-        write_session(folder / "session.toml", SessionFile(f"{scene}-{seed}", name, layout="generic"))
+        recording = recorder.RECORDINGS[formats[0]]
+        write_session(folder / "session.toml", SessionFile(f"{scene}-{seed}", recording, layout="generic"))
 
 
 def generator(seed: int, part: int) -> np.random.Generator:
