@@ -19,8 +19,12 @@ def match_pair(first: Descriptors, second: Descriptors, *, ratio: float) -> NDAr
     """
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), dtype=np.uint32)
-    distance = _squared_distances(first, second)
-    forward, forward_ok, backward, backward_ok = _mutual(distance, np.float32(ratio * ratio))
+    squared_ratio = np.float32(ratio * ratio)
+    if first.dtype == np.uint8 and second.dtype == np.uint8:
+        found = _mutual_bytes(first.astype(np.int16), second.astype(np.int16), squared_ratio)
+    else:
+        found = _mutual(_squared_distances(first, second), squared_ratio)
+    forward, forward_ok, backward, backward_ok = found
     rows = np.arange(len(first))
     kept = (backward[forward] == rows) & forward_ok & backward_ok[forward]
     return np.column_stack([rows[kept], forward[kept]]).astype(np.uint32)
@@ -89,6 +93,56 @@ def _mutual(distance, squared_ratio):  # type: ignore[no-untyped-def]
         row_best[i] = best
         row_ok[i] = first < squared_ratio * second
     return row_best, row_ok, column_best, column_first < squared_ratio * column_second
+
+
+@numba.njit(cache=True, nogil=True)
+def _mutual_bytes(first, second, squared_ratio):  # type: ignore[no-untyped-def]
+    """Do as `_mutual` for descriptors of small integers, whose dot products the compiler turns into vector code.
+
+    As fast as BLAS on one core, without its threads: many pairs are matched at once, each on one core.
+    """
+    n, m, width = first.shape[0], second.shape[0], first.shape[1]
+    first_square = np.zeros(n, dtype=np.int32)
+    second_square = np.zeros(m, dtype=np.int32)
+    for i in range(n):
+        for k in range(width):
+            first_square[i] += np.int32(first[i, k]) * np.int32(first[i, k])
+    for j in range(m):
+        for k in range(width):
+            second_square[j] += np.int32(second[j, k]) * np.int32(second[j, k])
+    far = np.int32(2**31 - 1)
+    row_best = np.zeros(n, dtype=np.int32)
+    row_first, row_second = np.full(n, far), np.full(n, far)
+    column_best = np.zeros(m, dtype=np.int32)
+    column_first, column_second = np.full(m, far), np.full(m, far)
+    dots = np.zeros(64, dtype=np.int32)
+    for begin in range(0, m, 64):
+        end = min(begin + 64, m)
+        for i in range(n):
+            for j in range(begin, end):
+                dot = np.int32(0)
+                for k in range(width):
+                    dot += np.int32(first[i, k]) * np.int32(second[j, k])
+                dots[j - begin] = dot
+            for j in range(begin, end):
+                d = first_square[i] + second_square[j] - np.int32(2) * dots[j - begin]
+                if d < row_second[i]:
+                    if d < row_first[i]:
+                        row_second[i] = row_first[i]
+                        row_first[i] = d
+                        row_best[i] = j
+                    else:
+                        row_second[i] = d
+                if d < column_second[j]:
+                    if d < column_first[j]:
+                        column_second[j] = column_first[j]
+                        column_first[j] = d
+                        column_best[j] = i
+                    else:
+                        column_second[j] = d
+    row_ok = row_first < squared_ratio * row_second
+    column_ok = column_first < squared_ratio * column_second
+    return row_best, row_ok, column_best, column_ok
 
 
 @numba.njit(cache=True, nogil=True)
