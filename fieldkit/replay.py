@@ -148,7 +148,8 @@ def _check_tags(recording: Recording, tags: TagMap) -> None:
         if tags.find(tag_id, visit=visit) is None:
             where = tags.path or "no tag file was given, and"
             raise ReplayError(
-                f"{where} has no tag {tag_id}, the {what} of visit {visit} in {recording.path}; expected one of {known}",
+                f"{where} has no tag {tag_id}, the {what} of visit {visit} in {recording.path}; "
+                f"expected one of {known}",
                 hint="photograph and calibrate this tag, or correct the tag id of the recording",
             )
 
@@ -292,8 +293,7 @@ def _localize_once(
     key = store.digest(np.ascontiguousarray(image).tobytes(), repr(image.shape), repr(view.frame.camera), settings)
     estimate = cache.get(key)
     if estimate is None:
-        estimate = localizer.localize(image, view.frame.camera)
-        cache.put(key, estimate)
+        estimate = cache.put(key, localizer.localize(image, view.frame.camera))
     return estimate
 
 

@@ -320,13 +320,14 @@ class EstimateCache:
             self._known = self._load()
         return self._known.get(key)
 
-    def put(self, key: str, estimate: Estimate) -> None:
-        """Append an estimate."""
+    def put(self, key: str, estimate: Estimate) -> Estimate:
+        """Append an estimate and return it as a second start will read it, to the last bit."""
         # The line break in front ends a line that a kill may have cut off.
         line = "\n" + json.dumps({"key": key, **_estimate_plain(estimate)}) + "\n"
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a", encoding="utf-8") as stream:
             stream.write(line)
+        return _estimate_from_plain(_estimate_plain(estimate))
 
     def remove(self) -> None:
         """Remove the file: the run is complete."""
