@@ -59,7 +59,7 @@ def read_source(path: Path) -> MapSource:
             hint="check the path",
         )
     if not (path / "images").is_dir():
-        raise MapError(f"{path}: no folder images/", hint="put the mapping images into images/")
+        raise MapError(f"{path}: no folder images/; expected it with the mapping images", hint="put them there")
     source = _read_rig_folder(path) if (path / "rig.toml").is_file() else _read_image_folder(path)
     if not source.images:
         raise MapError(
