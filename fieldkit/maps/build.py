@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
 from fieldkit.features import Features, extract, feature_kind, read_grey
-from fieldkit.frames import Pose, mean_pose
+from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import AlignmentEntry, MapFile, SurfaceEntry, content_digest, write_features, write_map_file
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
+from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
 from fieldkit.maps.pairs import choose_pairs, match_pairs
 from fieldkit.maps.rigs import contradicting
 from fieldkit.maps.sfm import reconstruct, threads
@@ -87,8 +88,8 @@ def build_map(
 ) -> MapReport:
     """Build a map folder from a rig folder or an image folder: features, SfM, metric frame, landmarks, surface.
 
-    Only images go into SfM; SLAM poses give scale, frame and gravity afterwards. The same source and seed give the
-    same map, whatever the number of processors. ``progress(step, done, total)`` is called along the way. Raises
+    Only images go into SfM; SLAM poses give scale, frame and gravity afterwards, and depth images refine the scale.
+    The same source and seed give the same map, whatever the number of processors. ``progress(step, done, total)`` is called along the way. Raises
     MapError when the source is incomplete, too few images register, or the poses do not fit; nothing is left behind.
     """
     options = MapOptions() if options is None else options
@@ -110,6 +111,8 @@ def build_map(
     clock.lap("reconstruct")
     sfm_poses = _registered(walk, model, options)
     alignment, warnings = _align(walk, sfm_poses, seed)
+    alignment, doubts = _scale_by_depth(walk, model, sfm_poses, alignment)
+    warnings += doubts
     mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
     for i in contradicting(walk.images, mapped):
         warnings.append(f"{walk.images[i].name} left out: its pose contradicts the rig")
@@ -190,6 +193,28 @@ def _align(walk: MapSource, sfm_poses: Mapping[int, Pose], seed: int) -> tuple[A
     return alignment, warnings
 
 
+def _scale_by_depth(
+    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], alignment: Alignment
+) -> tuple[Alignment, list[str]]:
+    """Take the metric scale from the depth images where there are any; SLAM's drift is in its scale."""
+    if walk.depth_camera is None:
+        return alignment, []
+    arrays, similarity = model_arrays(model), alignment.map_from_sfm
+    scaled = dataclasses.replace(arrays, xyz=similarity.points(arrays.xyz))
+    mapped = {i: similarity.pose(p) for i, p in sfm_poses.items()}
+    size = (walk.depth_camera.width, walk.depth_camera.height)
+    found = depth_scale(walk, scaled, mapped, read=lambda frame: _DepthReader(frame, *size)())
+    if found is None:
+        return alignment, []
+    posed = {i: p for i in sfm_poses if (p := walk.images[i].slam_from_cam) is not None}
+    return with_depth_scale(
+        alignment,
+        found,
+        sfm_centres=np.stack([sfm_poses[i].translation for i in posed]),
+        slam_centres=np.stack([p.translation for p in posed.values()]),
+    )
+
+
 def _finish_model(
     walk: MapSource, model: pycolmap.Reconstruction, map_from_sfm: Similarity, rules: LandmarkRules
 ) -> int:
@@ -218,10 +243,8 @@ def _surface(
     if walk.depth_camera is None:
         return None, ["no depth images: the map has no surface, and occlusion cannot be computed"]
     camera, views = walk.depth_camera, []
-    for frame in walk.depth:
-        anchors = [mapped[i] * cam_from_depth for i, cam_from_depth in frame.anchors if i in mapped]
-        if anchors:
-            views.append((mean_pose(anchors)[0], _DepthReader(frame, camera.width, camera.height)))
+    for frame, map_from_depth in depth_views(walk, mapped):
+        views.append((map_from_depth, _DepthReader(frame, camera.width, camera.height)))
     if not views:
         return None, ["no depth image belongs to a registered image: the map has no surface"]
     try:

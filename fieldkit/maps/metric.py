@@ -1,0 +1,118 @@
+"""Metric scale from depth images: drifting SLAM positions leave a per mille or more, a depth camera less."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.cameras import Camera
+from fieldkit.frames import Pose, mean_pose
+from fieldkit.maps.align import Alignment, Similarity
+from fieldkit.maps.landmarks import Model
+from fieldkit.maps.source import DepthFrame, MapSource
+
+Array = NDArray[np.float64]
+ReadDepth = Callable[[DepthFrame], NDArray[np.uint16]]
+
+_MIN_SAMPLES = 200
+_MAX_CHANGE = 0.05
+_RANGE_M = (0.4, 5.0)
+# Depth may change this much around a landmark; more is an edge, where landmark and pixel may lie on two surfaces.
+_FLAT = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthScale:
+    """Measured depth over mapped depth: median ratio over n landmarks, and the standard deviation of that median."""
+
+    ratio: float
+    sigma: float
+    n: int
+
+
+def depth_views(walk: MapSource, mapped: Mapping[int, Pose]) -> list[tuple[DepthFrame, Pose]]:
+    """Return the depth images that belong to mapped images, with map_from_depth."""
+    views = []
+    for frame in walk.depth:
+        anchors = [mapped[i] * cam_from_depth for i, cam_from_depth in frame.anchors if i in mapped]
+        if anchors:
+            views.append((frame, mean_pose(anchors)[0]))
+    return views
+
+
+def depth_scale(walk: MapSource, model: Model, mapped: Mapping[int, Pose], *, read: ReadDepth) -> DepthScale | None:
+    """Compare the depth of landmarks in the map with what the depth images measured at their pixels.
+
+    A landmark is compared in the depth images of the frames that observe it, where the depth around its pixel is
+    smooth. Returns None where there are too few of them, or no depth.
+    """
+    camera = walk.depth_camera
+    if camera is None:
+        return None
+    row = {name: i for i, name in enumerate(model.image_names)}
+    seen_by = _landmarks_of_images(model)
+    ratios = []
+    for frame, map_from_depth in depth_views(walk, mapped):
+        names = [walk.images[i].name for i, _ in frame.anchors if i in mapped]
+        seen = [seen_by[row[name]] for name in names if name in row]
+        if seen:
+            xyz = model.xyz[np.unique(np.concatenate(seen))]
+            ratios.append(_ratios(xyz, map_from_depth, camera, read(frame)))
+    values = np.concatenate(ratios) if ratios else np.zeros(0)
+    if len(values) < _MIN_SAMPLES:
+        return None
+    ratio = float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - ratio)))
+    return DepthScale(ratio, 1.2533 * spread / float(np.sqrt(len(values))), len(values))
+
+
+def with_depth_scale(
+    alignment: Alignment, found: DepthScale, *, sfm_centres: Array, slam_centres: Array
+) -> tuple[Alignment, list[str]]:
+    """Scale an alignment about the middle of its cameras; one that depth contradicts is kept, with a warning.
+
+    ``sfm_centres`` and ``slam_centres`` are the same camera centres (n, 3) in SfM's frame and as SLAM tracked them;
+    frame and gravity stay SLAM's, and the residuals are those to its positions after scaling.
+    """
+    if abs(found.ratio - 1.0) > _MAX_CHANGE:
+        return alignment, [
+            f"depth images say that the map is {100 * (found.ratio - 1):+.1f} % off in scale ({found.n} landmarks); "
+            "the SLAM scale is kept: check the units and the calibration of both"
+        ]
+    old = alignment.map_from_sfm
+    middle = old.points(sfm_centres).mean(axis=0)
+    moved = middle + found.ratio * (old.translation - middle)
+    similarity = Similarity(old.scale * found.ratio, old.rotation, moved)
+    residual = np.linalg.norm(similarity.points(sfm_centres) - slam_centres, axis=1)
+    used = residual[residual <= alignment.threshold_m]
+    scaled = dataclasses.replace(
+        alignment,
+        map_from_sfm=similarity,
+        source="depth",
+        n_used=len(used),
+        rms_m=float(np.sqrt(np.mean((used if len(used) else residual) ** 2))),
+        p95_m=float(np.percentile(residual, 95)),
+    )
+    return scaled, []
+
+
+def _landmarks_of_images(model: Model) -> list[NDArray[np.int32]]:
+    borders = np.searchsorted(model.observation_image, np.arange(len(model.image_names) + 1))
+    return [model.observation_landmark[a:b] for a, b in itertools.pairwise(borders)]
+
+
+def _ratios(xyz: Array, map_from_depth: Pose, camera: Camera, depth_mm: NDArray[np.uint16]) -> Array:
+    x_in_depth = map_from_depth.inv().apply(xyz)
+    pixels, inside = camera.project(x_in_depth)
+    inside &= (pixels >= 1).all(axis=1) & (pixels < (camera.width - 1, camera.height - 1)).all(axis=1)
+    column, line = pixels[inside].astype(int).T
+    around = np.stack([depth_mm[line + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]).astype(np.float64)
+    around /= 1000.0
+    measured = around[4]
+    good = (around.min(axis=0) > _RANGE_M[0]) & (around.max(axis=0) < _RANGE_M[1])
+    good &= np.ptp(around, axis=0) < _FLAT * measured
+    return np.asarray(measured[good] / x_in_depth[inside, 2][good])
