@@ -185,6 +185,21 @@ def test_retrieval_finds_images_of_the_same_place_and_matching_their_landmarks(
         assert max(pose_error(solved.map_from_cam, view)) < 1e-4
 
 
+def test_a_landmark_is_matched_by_the_descriptors_of_the_best_images_only(rng: np.random.Generator) -> None:
+    scene_map = make_map(rng, n_landmarks=60, n_images=12)
+    index = build_index(scene_map, seed=0)
+    order = np.array([7, 6, 8, 5, 9, 4], dtype=np.int32)
+    _, owner = stored_descriptors(scene_map, index, order)
+    observers = [
+        np.isin(order, scene_map.descriptor_image[scene_map.descriptor_landmark == k]).sum() for k in range(60)
+    ]
+    np.testing.assert_array_equal(np.bincount(owner, minlength=60), np.minimum(observers, 3))
+    best, owner_of_best = stored_descriptors(scene_map, index, order[:1])
+    stored, owner = stored_descriptors(scene_map, index, order)
+    for descriptor, landmark in zip(best, owner_of_best, strict=True):
+        assert (stored[owner == landmark] == descriptor).all(axis=1).any()
+
+
 def test_every_observed_landmark_describes_its_image_in_a_compact_map_too(rng: np.random.Generator) -> None:
     scene_map = make_map(rng, n_landmarks=80, n_images=6)
     _, first = np.unique(scene_map.descriptor_landmark, return_index=True)

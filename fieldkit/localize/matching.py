@@ -9,12 +9,27 @@ from fieldkit.features import Descriptors
 from fieldkit.localize.retrieval import Index
 from fieldkit.types import SceneMap
 
+# A landmark that many retrieved images observe is described by the most similar of them: further descriptors cost
+# as much and find hardly another match.
+PER_LANDMARK = 3
+
 
 def stored_descriptors(
     scene_map: SceneMap, index: Index, images: NDArray[np.int32]
 ) -> tuple[Descriptors, NDArray[np.int32]]:
-    """Return the descriptors (m, w) of the landmarks that these images observe, each once, and their landmarks (m,)."""
+    """Return descriptors (m, w) of the landmarks that these images (best first) observe, and their landmarks (m,).
+
+    Every landmark has up to three, those of the best images.
+    """
     if not len(images):
         return scene_map.descriptors[:0], scene_map.descriptor_landmark[:0]
-    rows = np.unique(np.concatenate([index.rows[int(i)] for i in images]))
-    return scene_map.descriptors[rows], scene_map.descriptor_landmark[rows]
+    rows = np.concatenate([index.rows[int(i)] for i in images])
+    _, first = np.unique(rows, return_index=True)
+    rows = rows[np.sort(first)]
+    order = np.argsort(scene_map.descriptor_landmark[rows], kind="stable")
+    owner = scene_map.descriptor_landmark[rows[order]]
+    position = np.arange(len(order))
+    begins = np.concatenate([[True], owner[1:] != owner[:-1]])
+    begin = np.maximum.accumulate(np.where(begins, position, 0))
+    kept = np.sort(rows[order[position - begin < PER_LANDMARK]])
+    return scene_map.descriptors[kept], scene_map.descriptor_landmark[kept]
