@@ -89,7 +89,8 @@ def build_map(
     """Build a map folder from a rig folder or an image folder: features, SfM, metric frame, landmarks, surface.
 
     Only images go into SfM; SLAM poses give scale, frame and gravity afterwards, and depth images refine the scale.
-    The same source and seed give the same map, whatever the number of processors. ``progress(step, done, total)`` is called along the way. Raises
+    The same source and seed give the same map, whatever the number of processors.
+    ``progress(step, done, total)`` is called along the way. Raises
     MapError when the source is incomplete, too few images register, or the poses do not fit; nothing is left behind.
     """
     options = MapOptions() if options is None else options
