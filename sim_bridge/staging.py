@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 FAMILY = "tag36h11"
 # White margin around the black square, in cells of the tag (the square has 8), and the board that carries the print.
 MARGIN_CELLS = 1
-# Places for the start tag that are looked at before the richest is taken.
-PLACES_SEEN = 20
+# Places for the start tag, and for a tripod, that are looked at before the richest is taken.
+PLACES_SEEN, TRIPODS_SEEN = 20, 4
 BOARD_M, BOARD_THICKNESS_M, POLE_M = 0.19, 0.006, 0.025
 # A quick look that tells how much there is to see around a tag.
 _GLANCE = Camera("PINHOLE", 320, 240, (230.0, 230.0, 160.0, 120.0))
@@ -167,8 +167,7 @@ def _place_start(scene: Scene, options: StageOptions, *, rng: np.random.Generato
         body = _body_before(scene, graph, tag, options, rng=rng)
         if body is None or not _room_for_photos(scene, tag):
             continue
-        value = richness(scene, look_at(place.apply([0.5, 0.5, 1.3]), place.translation))
-        value += richness(scene, look_at(place.apply([-0.5, 0.5, 1.3]), place.translation))
+        value = _background(scene, tag)
         if best is None or value > best[0]:
             best = (value, tag, body)
         seen += 1
@@ -274,29 +273,52 @@ def _sweep_is_clear(scene: Scene, body: Pose) -> bool:
 def _with_tripod_near(
     stage: Stage, body: Pose, options: StageOptions, *, index: int, rng: np.random.Generator
 ) -> Waypoint | None:
-    """Put a tripod near the robot where the arm sees its tag at a slant, a photographer fits, and no way is blocked."""
-    name, scene = f"w{index + 1:02d}", stage.scene
-    shoulder = body.apply(robot.SHOULDER_M)
+    """Put a tripod near the robot where the arm sees its tag at a slant, a photographer fits, and no way is blocked.
+
+    Of a few such places the one before the richest background is taken: a photo has to be localized by it.
+    """
+    scene = stage.scene
     bodies = [stage.world_from_start, *(w.world_from_body for w in stage.waypoints), body]
-    keep_off = np.array([p.translation[:2] for p in (*bodies[:-1], *(t.world_from_tag for t in stage.tags))])
-    for _ in range(40):
-        azimuth = rng.uniform(-np.pi, np.pi)
-        distance = rng.uniform(*options.tripod_distance_m)
-        at = shoulder + distance * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        at[2] = rng.uniform(0.75, 1.0)
-        away = azimuth + np.pi + np.radians(rng.uniform(26.0, 34.0)) * rng.choice([-1.0, 1.0])
-        tilt, roll = np.radians(rng.normal(0.0, 2.0, 2))
-        pose = facing(at, away, pitch_rad=tilt, roll_rad=roll)
-        tag = PlacedTag(options.first_tripod_id + index, options.tag_size_m, pose, visit=name)
-        if not scene.free_floor(at[:2], 0.16)[0] or np.linalg.norm(at[:2] - body.translation[:2]) < 0.75:
+    points = [pose.translation[:2] for pose in bodies]
+    keep_off = np.array([*points[:-1], *(t.world_from_tag.translation[:2] for t in stage.tags)])
+    best: tuple[int, Waypoint] | None = None
+    found = 0
+    for _ in range(60):
+        tag = _propose_tripod(body, options, index=index, rng=rng)
+        at = tag.world_from_tag.translation[:2]
+        if not scene.free_floor(at, 0.16)[0] or np.linalg.norm(at - body.translation[:2]) < 0.75:
             continue
-        if np.linalg.norm(keep_off - at[:2], axis=1).min() < 1.0 or not _room_for_photos(scene, tag):
+        if np.linalg.norm(keep_off - at, axis=1).min() < 1.0 or not _room_for_photos(scene, tag):
             continue
         arms = _truth_arms(scene, body, tag, options, rng=rng)
         graph = floor_graph(with_tag(scene, tag), options.drive_radius_m)
-        if len(arms) == options.truth_sightings and graph.connects([p.translation[:2] for p in bodies]):
-            return Waypoint(name, body, tag, arms)
-    return None
+        if len(arms) < options.truth_sightings or not graph.connects(points):
+            continue
+        value = _background(scene, tag)
+        if best is None or value > best[0]:
+            best = (value, Waypoint(f"w{index + 1:02d}", body, tag, arms))
+        found += 1
+        if found == TRIPODS_SEEN:
+            break
+    return None if best is None else best[1]
+
+
+def _propose_tripod(body: Pose, options: StageOptions, *, index: int, rng: np.random.Generator) -> PlacedTag:
+    shoulder = body.apply(robot.SHOULDER_M)
+    azimuth = rng.uniform(-np.pi, np.pi)
+    distance = rng.uniform(*options.tripod_distance_m)
+    at = shoulder + distance * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    at[2] = rng.uniform(0.75, 1.0)
+    away = azimuth + np.pi + np.radians(rng.uniform(26.0, 34.0)) * rng.choice([-1.0, 1.0])
+    tilt, roll = np.radians(rng.normal(0.0, 2.0, 2))
+    pose = facing(at, away, pitch_rad=tilt, roll_rad=roll)
+    return PlacedTag(options.first_tripod_id + index, options.tag_size_m, pose, visit=f"w{index + 1:02d}")
+
+
+def _background(scene: Scene, tag: PlacedTag) -> int:
+    """Return how much three photos of a tag, from the left, the middle and the right, would show."""
+    eyes = tag.world_from_tag.apply([[x, 0.55, 1.3] for x in (-0.9, 0.0, 0.9)])
+    return sum(richness(scene, look_at(eye, tag.world_from_tag.translation)) for eye in eyes)
 
 
 def _truth_arms(
