@@ -5,7 +5,7 @@ DEMO := build/demo
 SCENE ?= room
 SEED ?= 0
 
-.PHONY: install demo demo-clean test bench lint clean sample redkitchen
+.PHONY: install demo test bench lint sample redkitchen clean
 
 install: .venv/installed
 
@@ -36,6 +36,27 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The session that ships in data_samples: three waypoints, small images, one 8-bit descriptor per landmark.
+SAMPLE := data_samples/room
+sample: install
+	rm -rf build/sample $(SAMPLE)
+	$(BIN)/sim-bridge synthesize --scene room --seed 0 --waypoints 3 --quality 70 --format mcap --out build/sample/session
+	$(BIN)/fieldkit map build build/sample/session/mapping --out build/sample/lab.map
+	$(BIN)/fieldkit map compact build/sample/lab.map --out $(SAMPLE)/lab.map
+	$(BIN)/fieldkit tags calibrate build/sample/session/photos --map $(SAMPLE)/lab.map --size-m 0.1365 --out $(SAMPLE)/tags.toml
+	mkdir $(SAMPLE)/session
+	cp build/sample/session/robot.mcap build/sample/session/session.toml $(SAMPLE)/session/
+
+# The main line on real images: `make redkitchen DATA=folder` with frames/ and poses/ of the 7-Scenes red kitchen.
+KITCHEN := build/redkitchen
+redkitchen: install
+	@test -n "$(DATA)" || { echo 'give the folder with frames/ and poses/: make redkitchen DATA=...' >&2; exit 1; }
+	rm -rf $(KITCHEN)
+	$(BIN)/python docs/examples/redkitchen.py $(DATA) --out $(KITCHEN)/input
+	$(BIN)/fieldkit map build $(KITCHEN)/input/source --out $(KITCHEN)/lab.map
+	$(BIN)/fieldkit replay $(KITCHEN)/input/recording.mcap --map $(KITCHEN)/lab.map --protocol redkitchen --out $(KITCHEN)/run
+	$(BIN)/fieldkit report $(KITCHEN)/run --out $(KITCHEN)/report.html
 
 clean:
 	rm -rf build .venv
