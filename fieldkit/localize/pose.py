@@ -19,7 +19,7 @@ _NOISE_PX = 1.0
 _CAUCHY_FACTOR = 0.6123
 # Share of the landmarks' variance that all landmarks in view have in common, because the same mapping images placed
 # them. Set on one synthesized room whose map has its scale from depth: there the trimmed normalised errors of photos
-# and views are 0.8 and 0.6 per degree of freedom with it, 2.3 and 1.1 without. An error of the map's scale is not in it.
+# and views are 0.8 and 0.6 per degree of freedom with it, 2.3 and 1.1 without. A wrong map scale is not in it.
 _SHARED = 0.01
 _MIN_DEPTH_M = 0.05
 # Shares of the inlier bound at which RANSAC is started. Distant, nearly planar landmarks have two poses that agree
