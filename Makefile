@@ -41,7 +41,7 @@ lint: install
 SAMPLE := data_samples/room
 sample: install
 	rm -rf build/sample $(SAMPLE)
-	$(BIN)/sim-bridge synthesize --scene room --seed 0 --waypoints 3 --quality 70 --format mcap --out build/sample/session
+	$(BIN)/sim-bridge synthesize --scene room --seed 0 --waypoints 3 --quality 50 --format mcap --out build/sample/session
 	$(BIN)/fieldkit map build build/sample/session/mapping --out build/sample/lab.map
 	$(BIN)/fieldkit map compact build/sample/lab.map --out $(SAMPLE)/lab.map
 	$(BIN)/fieldkit tags calibrate build/sample/session/photos --map $(SAMPLE)/lab.map --size-m 0.1365 --out $(SAMPLE)/tags.toml
@@ -54,7 +54,7 @@ redkitchen: install
 	@test -n "$(DATA)" || { echo 'give the folder with frames/ and poses/: make redkitchen DATA=...' >&2; exit 1; }
 	rm -rf $(KITCHEN)
 	$(BIN)/python docs/examples/redkitchen.py $(DATA) --out $(KITCHEN)/input
-	$(BIN)/fieldkit map build $(KITCHEN)/input/source --out $(KITCHEN)/lab.map
+	$(BIN)/fieldkit map build $(KITCHEN)/input/source --scale slam --out $(KITCHEN)/lab.map
 	$(BIN)/fieldkit replay $(KITCHEN)/input/recording.mcap --map $(KITCHEN)/lab.map --protocol redkitchen --out $(KITCHEN)/run
 	$(BIN)/fieldkit report $(KITCHEN)/run --out $(KITCHEN)/report.html
 

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 from rich.console import Console
@@ -37,7 +37,13 @@ def inspect(recording: Positional[Path], *, layout: str | None = None, json: boo
 
 
 def map_build(
-    source: Positional[Path], *, out: Path, feature: str = "sift", voxel_m: float = 0.04, force: bool = False
+    source: Positional[Path],
+    *,
+    out: Path,
+    feature: str = "sift",
+    scale: Literal["auto", "slam"] = "auto",
+    voxel_m: float = 0.04,
+    force: bool = False,
 ) -> None:
     """Build a metric map: SfM landmarks from the images, frame and scale from SLAM poses, surface from depth.
 
@@ -45,12 +51,13 @@ def map_build(
         source: mapping folder (rig.toml) or image folder (images/, camera.toml, poses.txt, depth/)
         out: map folder to write
         feature: local feature of landmarks
+        scale: auto refines the SLAM poses' scale by calibrated depth images; slam does not
         voxel_m: edge length of a voxel of the surface
         force: replace an existing map
     """
     from fieldkit import maps
 
-    options = maps.MapOptions(voxel_m=voxel_m)
+    options = maps.MapOptions(scale=scale, voxel_m=voxel_m)
     with _progress() as progress:
         built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
     for warning in built.warnings:

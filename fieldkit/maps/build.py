@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -34,7 +35,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class MapOptions:
-    """Settings of map building; the defaults suit 50..500 images of rooms."""
+    """Settings of map building; the defaults suit 50..500 images of rooms.
+
+    ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
+    """
 
     max_keypoints: int = 2048
     max_image_size: int | None = 1600
@@ -43,6 +47,7 @@ class MapOptions:
     n_neighbours: int = 3
     min_registered: float = 0.5
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
+    scale: Literal["auto", "slam"] = "auto"
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
@@ -96,7 +101,7 @@ def build_map(
     options = MapOptions() if options is None else options
     tell: Progress = progress or (lambda step, done, total: None)
     feature_kind(feature)
-    refuse_existing(Path(out), force=force)
+    refuse_existing(Path(out), force=force, marker="map.toml")
     clock = _Clock()
     walk = read_source(Path(source))
     features = _extract_all(walk, feature, options, tell)
@@ -112,8 +117,9 @@ def build_map(
     clock.lap("reconstruct")
     sfm_poses = _registered(walk, model, options)
     alignment, warnings = _align(walk, sfm_poses, seed)
-    alignment, doubts = _scale_by_depth(walk, model, sfm_poses, alignment)
-    warnings += doubts
+    if options.scale == "auto":
+        alignment, doubts = _scale_by_depth(walk, model, sfm_poses, alignment)
+        warnings += doubts
     mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
     for i in contradicting(walk.images, mapped):
         warnings.append(f"{walk.images[i].name} left out: its pose contradicts the rig")
@@ -123,7 +129,7 @@ def build_map(
     clock.lap("align")
     surface, missing = _surface(walk, mapped, options, tell)
     clock.lap("surface")
-    with atomic_folder(Path(out), force=force) as folder:
+    with atomic_folder(Path(out), force=force, marker="map.toml") as folder:
         _write(folder, walk, model, features, mapped, surface)
         entry = MapFile(
             1,

@@ -49,7 +49,7 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
         scene_map.observation_px,
     )
     sizes = {n: (c.width, c.height) for n, c in zip(scene_map.image_names, scene_map.image_cameras, strict=True)}
-    with atomic_folder(Path(out), force=force) as folder:
+    with atomic_folder(Path(out), force=force, marker="map.toml") as folder:
         (folder / "sparse").mkdir()
         model_from_arrays(model, pixels).write_binary(folder / "sparse")
         write_features(folder / "features.h5", features, sizes, compress=True)
