@@ -370,7 +370,7 @@ def _print_recall(run: Any, *, preset: str | None) -> None:
     table = Table(*content.header, caption=content.caption)
     for row in content.rows:
         table.add_row(*row)
-    Console(width=max(120, Console().width)).print(table)
+    Console(width=max(140, Console().width)).print(table)
     for item in run.excluded:
         logging.getLogger(__name__).warning("excluded %s: %s", item.what, item.reason)
 

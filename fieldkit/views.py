@@ -77,7 +77,7 @@ def recorded_candidates(
     views = [v for v in visit.views if v.kind != "truth" and v.frame.body_from_cam is not None]
     if not any(v.kind in rules.kinds for v in views):
         raise ReplayError(
-            f"{recording.path}: visit {visit.id} has no view of kind {' or '.join(rules.kinds)} with a known camera pose",
+            f"{recording.path}: visit {visit.id} has no view of kind {' or '.join(rules.kinds)} that tf reaches",
             hint="record a sweep at the waypoint, or change candidates.kinds in the protocol",
         )
     cameras = {v.frame.camera for v in views}
