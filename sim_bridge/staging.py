@@ -24,8 +24,6 @@ Array = NDArray[np.float64]
 FAMILY = "tag36h11"
 # White margin around the black square, in cells of the tag (the square has 8), and the board that carries the print.
 MARGIN_CELLS = 1
-# Places for the start tag, and for a tripod, that are looked at before the richest is taken.
-PLACES_SEEN, TRIPODS_SEEN = 20, 4
 BOARD_M, BOARD_THICKNESS_M, POLE_M = 0.19, 0.006, 0.025
 # A quick look that tells how much there is to see around a tag.
 _GLANCE = Camera("PINHOLE", 320, 240, (230.0, 230.0, 160.0, 120.0))
@@ -33,12 +31,17 @@ _GLANCE = Camera("PINHOLE", 320, 240, (230.0, 230.0, 160.0, 120.0))
 
 @dataclasses.dataclass(frozen=True)
 class StageOptions:
-    """What is set up: number of waypoints, the tags' size, and the room that the robot needs."""
+    """What is set up: number of waypoints, the tags' size, and the room that the robot needs.
+
+    ``start_places`` and ``tripod_places`` are looked at before the one with the richest surroundings is taken.
+    """
 
     waypoints: int = 4
     tag_size_m: float = 0.1365
     start_tag_id: int = 1
     first_tripod_id: int = 2
+    start_places: int = 20
+    tripod_places: int = 4
     drive_radius_m: float = 0.36
     stand_radius_m: float = 0.42
     waypoint_radius_m: float = 0.5
@@ -171,7 +174,7 @@ def _place_start(scene: Scene, options: StageOptions, *, rng: np.random.Generato
         if best is None or value > best[0]:
             best = (value, tag, body)
         seen += 1
-        if seen == PLACES_SEEN:
+        if seen == options.start_places:
             break
     if best is None:
         raise SynthesisError(
@@ -298,7 +301,7 @@ def _with_tripod_near(
         if best is None or value > best[0]:
             best = (value, Waypoint(f"w{index + 1:02d}", body, tag, arms))
         found += 1
-        if found == TRIPODS_SEEN:
+        if found == options.tripod_places:
             break
     return None if best is None else best[1]
 

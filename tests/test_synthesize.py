@@ -19,19 +19,19 @@ from fieldkit.tags import tag_corners
 from fieldkit.types import Frame, Recording, Visit
 from sim_bridge import cli, mapper, photographer, recorder, robot, schedule, staging, synthesize
 from sim_bridge.errors import SynthesisError
-from sim_bridge.scene import SCENES
+from sim_bridge.scene import SCENES, Scene
 from sim_bridge.synthesize import SessionOptions, generator
 
 TINY = SessionOptions(
     walk=mapper.WalkOptions(stations=2),
-    stage=staging.StageOptions(waypoints=2, truth_sightings=10),
+    stage=staging.StageOptions(waypoints=2, truth_sightings=10, start_places=4, tripod_places=1),
     photos=photographer.PhotoOptions(start_photos=3, tripod_photos=2, scale=0.25),
     schedule=schedule.ScheduleOptions(start_images=3, sweep_yaws=6, sweep_pitches_deg=(0.0, 20.0), drive_images=1),
 )
 # As little as a session can be.
 LEAST = SessionOptions(
     walk=mapper.WalkOptions(stations=1),
-    stage=staging.StageOptions(waypoints=1, truth_sightings=2),
+    stage=staging.StageOptions(waypoints=1, truth_sightings=2, start_places=1, tripod_places=1),
     photos=photographer.PhotoOptions(start_photos=1, tripod_photos=1, scale=0.1),
     schedule=schedule.ScheduleOptions(start_images=1, sweep_yaws=3, sweep_pitches_deg=(0.0,), drive_images=0),
 )
@@ -39,8 +39,13 @@ SEED = 1
 
 
 @pytest.fixture(scope="module")
-def stage() -> staging.Stage:
-    return staging.set_stage(SCENES["room"](SEED), TINY.stage, rng=generator(SEED, 4))
+def room() -> Scene:
+    return SCENES["room"](SEED)
+
+
+@pytest.fixture(scope="module")
+def stage(room: Scene) -> staging.Stage:
+    return staging.set_stage(room, TINY.stage, rng=generator(SEED, 4))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +93,7 @@ def test_the_mapping_folder_is_complete(session: Path) -> None:
         assert image.shape == (camera.camera.height, camera.camera.width) == (640, 480)
 
 
-def test_mapped_depth_is_that_of_the_scene_at_the_true_pose(session: Path, stage: staging.Stage) -> None:
+def test_mapped_depth_is_that_of_the_scene_at_the_true_pose(session: Path, room: Scene) -> None:
     rig = read_rig(session / "mapping" / "rig.toml")
     assert rig.depth is not None
     truth = dict(read_tum(session / "truth" / "mapping_poses.txt"))
@@ -98,8 +103,7 @@ def test_mapped_depth_is_that_of_the_scene_at_the_true_pose(session: Path, stage
     depth = stored[::16, ::16] / 1000.0
     rows, columns = np.indices(depth.shape) * 16 + 0.5
     rays = rig.depth.camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
-    scene = SCENES["room"](SEED)
-    exact = scene.intersect(world_from_cam.translation, world_from_cam.rotation.apply(rays))
+    exact = room.intersect(world_from_cam.translation, world_from_cam.rotation.apply(rays))
     exact = (exact / np.linalg.norm(rays, axis=1)).reshape(depth.shape)
     seen = depth > 0
     assert seen.mean() > 0.5
