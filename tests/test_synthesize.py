@@ -22,18 +22,20 @@ from sim_bridge.errors import SynthesisError
 from sim_bridge.scene import SCENES, Scene
 from sim_bridge.synthesize import SessionOptions, generator
 
+# A robot in a hurry makes short recordings.
+FAST = schedule.ScheduleOptions(speed_m_s=1.5, turn_rad_s=3.0, arm_rad_s=4.0)
 TINY = SessionOptions(
     walk=mapper.WalkOptions(stations=2),
     stage=staging.StageOptions(waypoints=2, truth_sightings=10, start_places=4, tripod_places=1),
     photos=photographer.PhotoOptions(start_photos=3, tripod_photos=2, scale=0.25),
-    schedule=schedule.ScheduleOptions(start_images=3, sweep_yaws=6, sweep_pitches_deg=(0.0, 20.0), drive_images=1),
+    schedule=dataclasses.replace(FAST, start_images=3, sweep_yaws=6, sweep_pitches_deg=(0.0, 20.0), drive_images=1),
 )
 # As little as a session can be.
 LEAST = SessionOptions(
     walk=mapper.WalkOptions(stations=1),
     stage=staging.StageOptions(waypoints=1, truth_sightings=2, start_places=1, tripod_places=1),
     photos=photographer.PhotoOptions(start_photos=1, tripod_photos=1, scale=0.1),
-    schedule=schedule.ScheduleOptions(start_images=1, sweep_yaws=3, sweep_pitches_deg=(0.0,), drive_images=0),
+    schedule=dataclasses.replace(FAST, start_images=1, sweep_yaws=3, sweep_pitches_deg=(0.0,), drive_images=0),
 )
 SEED = 1
 
