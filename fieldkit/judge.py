@@ -127,11 +127,14 @@ def _judge_tags(tags: TagMap, truth: Path, gauge: Gauge) -> list[dict[str, Any]]
     true = store.read_tags(truth / "tags.toml")
     result = []
     for tag in tags.tags:
-        known = true.find(tag.id, visit=tag.visit)
-        if known is None and any(t.id == tag.id for t in true.tags):
-            continue  # another visit's tag, seen in passing: the truth does not say where it stood then
-        if known is None:
+        same_id = [t for t in true.tags if t.id == tag.id]
+        if not same_id:
             raise JudgeError(f"{truth / 'tags.toml'}: has no tag {tag.id}", hint="judge with the session's own tags")
+        known = true.find(tag.id, visit=tag.visit)
+        if known is None and tag.visit is None and len(same_id) == 1:
+            known = same_id[0]
+        if known is None:
+            continue  # another visit's tag, seen in passing: the truth does not say where it stood then
         estimate = gauge.world_from_map * tag.map_from_tag
         result.append(_entry({"id": tag.id, "visit": tag.visit}, estimate, known.map_from_tag, tag.covariance))
     return result

@@ -185,15 +185,17 @@ class _Problem:
     def minimise(self, start: Pose, used: Mask, scale: float) -> Pose:
         """Minimise the weighted residuals from a start by Levenberg-Marquardt; weights follow the pose."""
         pose, damping = start, 1e-6
-        cost = float(self.chi2(pose, scale)[used].sum())
+        cost = self._cost(pose, used, scale)
         for _ in range(40):
+            if not np.isfinite(cost):
+                break
             residual, by_tag, by_cam = self.linearise(pose)
             weighted = np.einsum("nab,nbj->naj", self.weights(by_cam, scale)[0], by_tag)[used]
             normal = np.einsum("nai,naj->ij", by_tag[used], weighted)
             gradient = np.einsum("nai,na->i", weighted, residual[used])
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             candidate = pose * exp(step)
-            new = float(self.chi2(candidate, scale)[used].sum())
+            new = self._cost(candidate, used, scale)
             if new < cost:
                 gain, pose, cost, damping = cost - new, candidate, new, max(damping / 10, 1e-12)
                 if gain < 1e-10 * (1.0 + cost):
@@ -203,6 +205,14 @@ class _Problem:
             else:
                 damping *= 10
         return pose
+
+    def _cost(self, pose: Pose, used: Mask, scale: float) -> float:
+        """Return the sum to be minimised; infinite where a step puts the tag into a camera's plane."""
+        try:
+            cost = float(self.chi2(pose, scale)[used].sum())
+        except np.linalg.LinAlgError:
+            return float("inf")
+        return cost if np.isfinite(cost) else float("inf")
 
 
 @dataclasses.dataclass(frozen=True)
