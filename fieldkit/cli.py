@@ -278,14 +278,25 @@ def judge(
     for title in ("gauge", "map", "estimates"):
         if found[title]:
             _print_mapping(found[title], title=title)
-    for title, keys in (("tags", ("id", "visit")), ("priors", ("visit",)), ("truths", ("visit", "view"))):
-        if not found[title]:
-            continue
-        table = _table(*keys, "position m", "rotation deg", "nees", title=title)
-        for entry in found[title]:
-            numbers = [f"{entry['position_m']:.4f}", f"{entry['rotation_deg']:.3f}", f"{entry['nees']:.1f}"]
-            table.add_row(*map_str([*(entry[k] or "-" for k in keys), *numbers]))
-        console.print(table)
+    for title, keys in (("tags", ("id", "visit")), ("priors", ("visit",))):
+        if found[title]:
+            table = _table(*keys, "position m", "rotation deg", "nees", title=title)
+            for entry in found[title]:
+                numbers = [f"{entry['position_m']:.4f}", f"{entry['rotation_deg']:.3f}", f"{entry['nees']:.1f}"]
+                table.add_row(*map_str([*(entry[k] or "-" for k in keys), *numbers]))
+            console.print(table)
+    if found["truths"]:
+        console.print(_truth_table(found["truths"]))
+
+
+def _truth_table(entries: Sequence[dict[str, Any]]) -> Table:
+    """Return the errors of the truth, a row per visit; every view is in the JSON."""
+    table = _table("visit", "views", "largest position m", "largest rotation deg", title="truths")
+    for visit in dict.fromkeys(e["visit"] for e in entries):
+        rows = [e for e in entries if e["visit"] == visit]
+        position, rotation = (max(e[key] for e in rows) for key in ("position_m", "rotation_deg"))
+        table.add_row(*map_str([visit, len(rows), f"{position:.4f}", f"{rotation:.3f}"]))
+    return table
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {
