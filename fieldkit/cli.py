@@ -121,28 +121,7 @@ def tags_calibrate(
         tags = calibrate_tags(photos, map, camera=camera, sizes_m=parse_sizes(size_m), progress=progress)
     store.write_tags(out, tags)
     if json:
-        _print_json(
-            {
-                "version": 1,
-                "map_digest": tags.map_digest,
-                "tags": [
-                    {
-                        "id": t.id,
-                        "visit": t.visit,
-                        "position_m": t.map_from_tag.translation,
-                        "quaternion_xyzw": t.map_from_tag.rotation.as_quat(),
-                        "n_photos": t.n_photos,
-                        "rms_px": t.rms_px,
-                        "verdict": t.verdict,
-                    }
-                    for t in tags.tags
-                ],
-                "photos": [
-                    {"file": p.file, "tag_id": p.tag_id, "visit": p.visit, "used": p.used, "reason": p.reason}
-                    for p in tags.photos
-                ],
-            }
-        )
+        _print_json(_tags_json(tags))
         return
     table = _table("tag", "visit", "photos", "rms px", "sigma mm", "sigma deg", "verdict")
     for t in tags.tags:
@@ -153,6 +132,26 @@ def tags_calibrate(
     for photo in tags.photos:
         if not photo.used:
             logging.getLogger(__name__).warning("%s: not used: %s", photo.file, photo.reason)
+
+
+def _tags_json(tags: Any) -> dict[str, Any]:
+    entries = [
+        {
+            "id": t.id,
+            "visit": t.visit,
+            "position_m": t.map_from_tag.translation,
+            "quaternion_xyzw": t.map_from_tag.rotation.as_quat(),
+            "covariance": t.covariance.ravel(),
+            "n_photos": t.n_photos,
+            "rms_px": t.rms_px,
+            "verdict": t.verdict,
+        }
+        for t in tags.tags
+    ]
+    photos = [
+        {"file": p.file, "tag_id": p.tag_id, "visit": p.visit, "used": p.used, "reason": p.reason} for p in tags.photos
+    ]
+    return {"version": 1, "map_digest": tags.map_digest, "tags": entries, "photos": photos}
 
 
 def localize(
@@ -182,7 +181,7 @@ def localize(
     if failed:
         logging.getLogger(__name__).warning("%d of %d images failed: %s", len(failed), len(found), ", ".join(failed))
     if json:
-        _print_json([{"name": n, **_estimate_json(e)} for n, e in found])
+        _print_json({"version": 1, "images": [{"name": n, **_estimate_json(e)} for n, e in found]})
         return
     table = _table("image", "status", "matches", "inliers", "seconds")
     for name, e in found:
@@ -198,8 +197,8 @@ def replay(
     tags: Path | None = None,
     protocol: str = "paper_real",
     force: bool = False,
-) -> None:
-    """Replay recordings through every policy of a protocol; print the recall table.
+) -> int:
+    """Replay recordings through every policy of a protocol; print the recall table, exit with 3 on a missed bound.
 
     Args:
         recordings: bag files, ROS 2 bag folders, or session folders
@@ -218,6 +217,7 @@ def replay(
             recordings, map_path=map, tags_path=tags, protocol=rules, out=out, force=force, progress=progress
         )
     _print_recall(run, preset=None)
+    return _missed_bounds(run)
 
 
 def score(run: Positional[Path], *, preset: str | None = None, json: bool = False) -> int:
@@ -235,10 +235,7 @@ def score(run: Positional[Path], *, preset: str | None = None, json: bool = Fals
         _print_json(scores.score_dict(loaded, thresholds=None if preset is None else scores.preset(preset)))
     else:
         _print_recall(loaded, preset=preset)
-    misses = scores.check_expect(loaded)
-    for miss in misses:
-        logging.getLogger(__name__).error("%s: %s", run, miss)
-    return 3 if misses else 0
+    return _missed_bounds(loaded)
 
 
 def report(runs: Positional[tuple[Path, ...]], *, out: Path, force: bool = False) -> None:
@@ -319,7 +316,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     logging.basicConfig(
         level=logging.INFO,
         format="%(message)s",
-        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)],
+        handlers=[RichHandler(console=_log_console(), show_time=False, show_path=False, markup=False)],
     )
     try:
         sys.exit(_dispatch(words))
@@ -332,6 +329,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("fieldkit: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _log_console() -> Console:
+    """Return the console of log lines; away from a terminal every message stays on one line."""
+    console = Console(stderr=True)
+    return console if console.is_terminal else Console(stderr=True, width=100_000)
 
 
 def _dispatch(words: Sequence[str]) -> int:
@@ -384,6 +387,16 @@ def _print_recall(run: Any, *, preset: str | None) -> None:
     Console(width=max(140, Console().width)).print(table)
     for item in run.excluded:
         logging.getLogger(__name__).warning("excluded %s: %s", item.what, item.reason)
+
+
+def _missed_bounds(run: Any) -> int:
+    """Log every [[expect]] bound that a run misses and return the exit status."""
+    from fieldkit import scores
+
+    misses = scores.check_expect(run)
+    for miss in misses:
+        logging.getLogger(__name__).error("%s: %s", run.path or run.protocol.name, miss)
+    return 3 if misses else 0
 
 
 def _estimate_json(estimate: Any) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
+import math
 import re
 import tomllib
 from pathlib import Path
@@ -18,6 +19,8 @@ POLICY_NAMES = (
 )  # fmt: skip
 COUNTING = ("max", "angle", "fim", "mlp", "vpt", "vpt_dino", "vpt_appearance")
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Pitch = Annotated[float, msgspec.Meta(ge=-90, le=90)]
 
 
 class Threshold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -30,17 +33,17 @@ class Threshold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CandidateRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which recorded views ranking policies choose among, and how visibility is computed at them."""
 
-    kinds: tuple[Literal["sweep", "stowed", "forward"], ...] = ("sweep",)
-    min_distance_m: float = 0.1
+    kinds: Annotated[tuple[Literal["sweep", "stowed", "forward"], ...], msgspec.Meta(min_length=1)] = ("sweep",)
+    min_distance_m: Annotated[float, msgspec.Meta(ge=0)] = 0.1
     max_distance_m: Positive = 5.0
-    forward_pitch_deg: float = 0.0
+    forward_pitch_deg: Pitch = 0.0
     last_forward: Literal["previous", "body"] = "previous"
 
 
 class OcclusionRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """With and without the filter, and how far behind the surface (in voxels) a landmark still counts as visible."""
 
-    use: tuple[bool, ...] = (False, True)
+    use: Annotated[tuple[bool, ...], msgspec.Meta(min_length=1, max_length=2)] = (False, True)
     tolerance_voxels: Positive = 2.0
 
 
@@ -67,8 +70,8 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     policy: str
     position_m: Positive
     rotation_deg: Positive
-    min_recall: float = 0.0
-    max_recall: float = 1.0
+    min_recall: Share = 0.0
+    max_recall: Share = 1.0
     occlusion: bool | None = None
 
 
@@ -76,12 +79,12 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything that is fixed before a recording is replayed and scored."""
 
     name: str
-    thresholds: tuple[Threshold, ...]
-    policies: tuple[str, ...]
+    thresholds: Annotated[tuple[Threshold, ...], msgspec.Meta(min_length=1)]
+    policies: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     version: Literal[1] = 1
     pose: Literal["cam", "body"] = "body"
     feature: str = "sift"
-    seed: int = 0
+    seed: Annotated[int, msgspec.Meta(ge=0, lt=2**31)] = 0
     candidates: CandidateRules = CandidateRules()
     occlusion: OcclusionRules = OcclusionRules()
     localizer: LocalizerRules = LocalizerRules()
@@ -133,10 +136,13 @@ def _folder() -> Any:
 
 def _read(name_or_path: str | Path) -> tuple[str, str]:
     path = Path(name_or_path)
-    if path.suffix == ".toml" or path.exists():
+    if path.suffix == ".toml" or path.is_file():
         if not path.is_file():
             raise ProtocolError(f"{path}: no such protocol file", hint=suggestion(str(path), known_protocols()))
-        return path.read_text(encoding="utf-8"), str(path)
+        try:
+            return path.read_text(encoding="utf-8"), str(path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise ProtocolError(f"{path}: cannot be read as text; expected TOML", hint="check the file") from error
     if str(name_or_path) not in known_protocols():
         raise ProtocolError(
             f"unknown protocol {str(name_or_path)!r}; expected a name or a .toml file",
@@ -167,14 +173,42 @@ def _check(protocol: Protocol, source: str) -> None:
     for name in (*protocol.policies, *(e.policy for e in protocol.expect)):
         if name not in POLICY_NAMES:
             raise ProtocolError(f"{source}: unknown policy {name!r}", hint=suggestion(name, POLICY_NAMES))
-    if not protocol.thresholds:
-        raise ProtocolError(f"{source}: no thresholds; expected at least one", hint="add [[thresholds]]")
-    if len(set(protocol.policies)) != len(protocol.policies):
-        raise ProtocolError(f"{source}: a policy is listed twice in {list(protocol.policies)}", hint="list it once")
+    where = _not_finite(to_dict(protocol), "$")
+    if where is not None:
+        raise ProtocolError(f"{source}: the number at {where} is not finite", hint="correct the protocol")
+    lists = (protocol.policies, protocol.thresholds, protocol.occlusion.use, protocol.candidates.kinds)
+    for values in lists:
+        if len(set(values)) != len(values):
+            raise ProtocolError(f"{source}: listed twice in {msgspec.to_builtins(values)}", hint="list it once")
+    if protocol.candidates.min_distance_m >= protocol.candidates.max_distance_m:
+        raise ProtocolError(
+            f"{source}: candidates.min_distance_m is {protocol.candidates.min_distance_m:g}; expected less than "
+            f"max_distance_m, {protocol.candidates.max_distance_m:g}",
+            hint="correct the protocol",
+        )
     for bound in protocol.expect:
-        if Threshold(bound.position_m, bound.rotation_deg) not in protocol.thresholds:
-            raise ProtocolError(
-                f"{source}: [[expect]] at {bound.position_m:g} m / {bound.rotation_deg:g} deg is not one of the "
-                "protocol's thresholds",
-                hint="add it to [[thresholds]]",
-            )
+        _check_bound(bound, protocol, source)
+
+
+def _check_bound(bound: Expect, protocol: Protocol, source: str) -> None:
+    what = f"{source}: [[expect]] of {bound.policy}"
+    if bound.policy not in protocol.policies:
+        raise ProtocolError(f"{what}: it is not one of the protocol's policies", hint="add it to policies")
+    if Threshold(bound.position_m, bound.rotation_deg) not in protocol.thresholds:
+        raise ProtocolError(
+            f"{what} at {bound.position_m:g} m / {bound.rotation_deg:g} deg is not one of the protocol's thresholds",
+            hint="add it to [[thresholds]]",
+        )
+    if bound.min_recall > bound.max_recall:
+        raise ProtocolError(f"{what}: min_recall exceeds max_recall", hint="correct the bound")
+
+
+def _not_finite(value: Any, where: str) -> str | None:
+    """Return the place of the first number that is not finite: run.json could not hold it."""
+    if isinstance(value, dict):
+        found = (_not_finite(v, f"{where}.{k}") for k, v in value.items())
+    elif isinstance(value, list | tuple):
+        found = (_not_finite(v, f"{where}[{i}]") for i, v in enumerate(value))
+    else:
+        return where if isinstance(value, float) and not math.isfinite(value) else None
+    return next((f for f in found if f is not None), None)

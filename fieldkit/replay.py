@@ -18,7 +18,7 @@ import numpy as np
 
 from fieldkit import maps, policies, scores, store
 from fieldkit.bags import open_recording
-from fieldkit.errors import FrameError, PriorError, ReplayError, TruthError
+from fieldkit.errors import FrameError, PriorError, ReplayError, TagError, TruthError
 from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer
 from fieldkit.prior import estimate_prior
@@ -40,6 +40,7 @@ from fieldkit.types import (
     Truth,
     View,
     ViewResult,
+    Visit,
     VisitPlan,
 )
 from fieldkit.views import forward_directions, landmark_statistics, recorded_candidates
@@ -47,6 +48,8 @@ from fieldkit.views import forward_directions, landmark_statistics, recorded_can
 log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 THUMBNAIL_PX = 240
+# What leaves a visit out, with its reason; any other error ends the replay.
+EXCLUDING = (PriorError, TruthError, FrameError, ReplayError, TagError)
 PLAN_LANDMARKS = 6000
 LIBRARIES = ("fieldkit", "numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "pupil-apriltags", "rosbags")
 
@@ -77,7 +80,7 @@ def replay(
 
     Views are localized once and kept in a cache beside ``out`` until the run is complete, so that a second start
     after a kill resumes. Raises FieldkitError where map, tags, recordings and protocol do not fit together; a visit
-    without prior or truth is excluded with its reason.
+    without prior, truth or candidates is excluded with its reason, and so is a view without truth or odometry.
     """
     store.refuse_existing(Path(out), force=force, marker="run.json")
     for name in protocol.policies:
@@ -94,7 +97,7 @@ def replay(
     sessions = [_replay_session(r, scene_map, tags, protocol, cache=cache, progress=progress) for r in opened]
     run = _collect(opened, sessions, scene_map=scene_map, tags=tags, protocol=protocol)
     if not run.trials:
-        reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3])
+        reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3]) or "there is no visit"
         raise ReplayError(f"{recordings[0]}: no visit could be scored: {reasons}", hint="see the reasons")
     store.write_run(out, run, force=force)
     cache.remove()
@@ -135,23 +138,44 @@ def _check_names(recordings: Sequence[Recording]) -> None:
     names = [r.name for r in recordings]
     for r in recordings:
         if names.count(r.name) > 1:
-            raise ReplayError(f"{r.path}: the session {r.name!r} is given twice", hint="give each recording once")
+            raise ReplayError(
+                f"{r.path}: another recording is named {r.name!r} too; expected different session names",
+                hint="give each recording once, or name one in a session.toml beside it",
+            )
 
 
 def _check_tags(recording: Recording, tags: TagMap) -> None:
     """Raise ReplayError for a tag that the recording names and the tag file lacks, before any work is done."""
-    wanted = [(s.tag_id, s.visit, "start tag") for s in recording.starts if s.tag_id is not None]
-    if recording.reference is None:
-        wanted += [(v.truth_tag_id, v.id, "tripod tag") for v in recording.visits if v.truth_tag_id is not None]
+    wanted: list[tuple[int, str | None, str]] = []
+    for visit in recording.visits:
+        own = [s for s in recording.starts if s.visit == visit.id] or [s for s in recording.starts if s.visit is None]
+        wanted += [(s.tag_id, visit.id, "start tag") for s in own if s.tag_id is not None]
+        if recording.reference is None and visit.truth_tag_id is not None:
+            wanted.append((visit.truth_tag_id, visit.id, "tripod tag"))
     known = sorted({t.id for t in tags.tags})
-    for tag_id, visit, what in wanted:
-        if tags.find(tag_id, visit=visit) is None:
+    doubtful = set()
+    for tag_id, visit_id, what in wanted:
+        tag = tags.find(tag_id, visit=visit_id)
+        if tag is None:
             where = tags.path or "no tag file was given, and"
             raise ReplayError(
-                f"{where} has no tag {tag_id}, the {what} of visit {visit} in {recording.path}; "
+                f"{where} has no tag {tag_id}, the {what} of visit {visit_id} in {recording.path}; "
                 f"expected one of {known}",
                 hint="photograph and calibrate this tag, or correct the tag id of the recording",
             )
+        if tag.verdict != "pass":
+            doubtful.add(f"the {what} {tag_id} has the verdict {tag.verdict!r}")
+    for doubt in sorted(doubtful):
+        log.warning("%s: %s: take more photos of it", tags.path, doubt)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ready:
+    """A visit that can be scored: the candidates are its views whose truth is known."""
+
+    prior: Prior
+    truths: Mapping[str, Truth]
+    candidates: Candidates
 
 
 def _replay_session(
@@ -166,26 +190,22 @@ def _replay_session(
     _check_tags(recording, tags)
     for warning in recording.warnings:
         log.warning("%s: %s", recording.path, warning)
-    priors, truths, excluded = _priors_and_truths(recording, tags, protocol)
-    visits = [v for v in recording.visits if v.id in priors]
-    forward = forward_directions(visits, [priors[v.id] for v in visits], rules=protocol.candidates)
+    ready, excluded = _prepare(recording, tags, protocol)
     localizer = Localizer(scene_map, protocol.localizer, seed=protocol.seed)
     look = _Looker(scene_map, protocol)
     parts = []
-    for number, (visit, direction) in enumerate(zip(visits, forward, strict=True), start=1):
+    for number, (visit_id, known) in enumerate(ready.items(), start=1):
         if progress is not None:
-            progress(f"replay {recording.name}", number, len(visits))
-        candidates = recorded_candidates(
-            recording, visit, priors[visit.id], rules=protocol.candidates, forward_in_map=direction
-        )
-        prior_error = _prior_error(recording, priors[visit.id], truths[visit.id])
-        plan = VisitPlan(recording.name, priors[visit.id], prior_error, candidates, look.utilities(candidates))
-        chosen = {v.id: v for v in visit.views if v.id in candidates.view_ids}
+            progress(f"replay {recording.name}", number, len(ready))
+        prior_error = _prior_error(recording, known.prior, known.truths)
+        plan = VisitPlan(recording.name, known.prior, prior_error, known.candidates, look.utilities(known.candidates))
+        views = next(v for v in recording.visits if v.id == visit_id).views
+        chosen = {v.id: v for v in views if v.id in known.candidates.view_ids}
         parts.append(
             _score_visit(
                 plan,
                 chosen,
-                truths[visit.id],
+                known.truths,
                 protocol,
                 map_digest=scene_map.digest,
                 localizer=localizer,
@@ -195,28 +215,57 @@ def _replay_session(
     return _Session(
         trials=tuple(t for p in parts for t in p.trials),
         results=tuple(r for p in parts for r in p.results),
-        truths=tuple(t for v in visits for t in truths[v.id].values()),
+        truths=tuple(t for known in ready.values() for t in known.truths.values()),
         plans=tuple(p for part in parts for p in part.plans),
         thumbnails={k: v for p in parts for k, v in p.thumbnails.items()},
         excluded=tuple(excluded),
     )
 
 
-def _priors_and_truths(
-    recording: Recording, tags: TagMap, protocol: Protocol
-) -> tuple[dict[str, Prior], dict[str, dict[str, Truth]], list[Excluded]]:
+def _prepare(recording: Recording, tags: TagMap, protocol: Protocol) -> tuple[dict[str, _Ready], list[Excluded]]:
+    """Find prior, truth and candidates of every visit before anything is localized; say what is left out and why."""
     priors: dict[str, Prior] = {}
-    truths: dict[str, dict[str, Truth]] = {}
+    ready: dict[str, _Ready] = {}
     excluded: list[Excluded] = []
     for visit in recording.visits:
         try:
-            prior = estimate_prior(recording, visit, tags, noise=protocol.odometry)
-            truths[visit.id] = estimate_truths(recording, visit, tags)
-            priors[visit.id] = prior
-        except (PriorError, TruthError, FrameError) as error:
+            priors[visit.id] = estimate_prior(recording, visit, tags, noise=protocol.odometry)
+        except EXCLUDING as error:
             excluded.append(Excluded(f"{recording.name}/{visit.id}", str(error)))
-            log.warning("%s: visit %s is excluded: %s", recording.path, visit.id, error)
-    return priors, truths, excluded
+    located = [v for v in recording.visits if v.id in priors]
+    # The way goes on to the next waypoint whether or not its truth is known.
+    ahead = forward_directions(located, [priors[v.id] for v in located], rules=protocol.candidates)
+    for visit, direction in zip(located, ahead, strict=True):
+        try:
+            truths = estimate_truths(recording, visit, tags)
+            usable, dropped = _usable_views(recording, visit, truths)
+            candidates = recorded_candidates(
+                recording, usable, priors[visit.id], rules=protocol.candidates, forward_in_map=direction
+            )
+        except EXCLUDING as error:
+            excluded.append(Excluded(f"{recording.name}/{visit.id}", str(error)))
+            continue
+        excluded += dropped
+        ready[visit.id] = _Ready(priors[visit.id], truths, candidates)
+    for item in excluded:
+        log.warning("%s: %s is excluded: %s", recording.path, item.what, item.reason)
+    return ready, excluded
+
+
+def _usable_views(recording: Recording, visit: Visit, truths: Mapping[str, Truth]) -> tuple[Visit, list[Excluded]]:
+    """Return the visit with the views whose truth and odometry are known, and what was left out."""
+    kept, dropped = [], []
+    for view in visit.views:
+        reason = None if view.id in truths else "its truth is not known"
+        try:
+            recording.odometry.at(view.frame.t_ns)
+        except FrameError as error:
+            reason = error.message
+        if reason is None:
+            kept.append(view)
+        else:
+            dropped.append(Excluded(f"{recording.name}/{visit.id}/{view.id}", reason))
+    return dataclasses.replace(visit, views=tuple(kept)), dropped
 
 
 def _prior_error(recording: Recording, prior: Prior, truths: Mapping[str, Truth]) -> tuple[float, float]:
@@ -277,7 +326,7 @@ def _score_visit(
 ) -> _Session:
     results: dict[str, ViewResult] = {}
     thumbnails: dict[str, bytes] = {}
-    settings = repr((map_digest, protocol.feature, protocol.localizer, protocol.seed))
+    settings = repr((map_digest, protocol.feature, protocol.localizer, protocol.seed, _versions()))
     for view in views.values():
         image = view.frame.read()
         estimate = _localize_once(image, view, localizer, cache=cache, settings=settings)
@@ -322,7 +371,7 @@ def _collect(
         recordings=tuple(r.path for r in recordings),
         sessions=tuple(r.name for r in recordings),
         seed=protocol.seed,
-        versions={name: _version(name) for name in LIBRARIES},
+        versions=_versions(),
         trials=tuple(t for s in sessions for t in s.trials),
         results=tuple(r for s in sessions for r in s.results),
         truths=tuple((r.name, t) for r, s in zip(recordings, sessions, strict=True) for t in s.truths),
@@ -331,6 +380,10 @@ def _collect(
         thumbnails={k: v for s in sessions for k, v in s.thumbnails.items()},
         excluded=tuple(e for s in sessions for e in s.excluded),
     )
+
+
+def _versions() -> dict[str, str]:
+    return {name: _version(name) for name in LIBRARIES}
 
 
 def _version(name: str) -> str:

@@ -130,7 +130,7 @@ def make_trials(
     trials: list[Trial] = []
     for policy, occlusion in _ordered(variants, protocol.policies):
         if policy == ODOMETRY:
-            rows = [(reference, 1.0, 0.0, _score_prior(plan, truths[reference]))]
+            rows = [(reference, 1.0, 0.0, _score_prior(plan, reference, truths[reference]))]
         elif policy == BEST_POSSIBLE:
             rows = _best_rows(plan, results, truths, protocol=protocol)
         else:
@@ -204,8 +204,8 @@ def _best_rows(
 def _reference(plan: VisitPlan, truths: Mapping[str, Truth], *, wanted: str | None) -> str:
     visit, candidates = plan.prior.visit, plan.candidates
     if wanted is not None:
-        if wanted not in truths:
-            raise ScoreError(f"visit {visit}: view {wanted!r} has no truth", hint="name a view that has one")
+        if wanted not in truths or wanted not in candidates.view_ids:
+            raise ScoreError(f"visit {visit}: view {wanted!r} has no truth", hint="name a candidate that has one")
         return wanted
     by_kind = [
         v
@@ -234,8 +234,9 @@ def _score_view(plan: VisitPlan, view: str, results: Mapping[str, ViewResult], t
     return _Scored(estimate.status, cam_error, body_error, truth.sigma)
 
 
-def _score_prior(plan: VisitPlan, truth: Truth) -> _Scored:
-    cam_error, body_error = _errors(plan.prior.map_from_body * truth.body_from_cam, truth)
+def _score_prior(plan: VisitPlan, view: str, truth: Truth) -> _Scored:
+    """Score the prior where odometry has carried it since: the candidate pose of the view."""
+    cam_error, body_error = _errors(plan.candidates.map_from_cam[plan.candidates.view_ids.index(view)], truth)
     return _Scored("ok", cam_error, body_error, truth.sigma)
 
 
@@ -286,6 +287,20 @@ def recall(trials: Sequence[Trial], threshold: Threshold, *, pose: PoseName) -> 
     return min(math.fsum(per_visit) / len(per_visit), 1.0) if per_visit else 0.0
 
 
+def check_weights(trials: Iterable[Trial]) -> None:
+    """Raise ScoreError where the choices of a policy at a visit do not add up to one: the recall would be wrong."""
+    total: dict[tuple[str, str, str, bool | None], float] = {}
+    for t in trials:
+        key = (t.session, t.visit, t.policy, t.occlusion)
+        total[key] = total.get(key, 0.0) + t.weight
+    for (session, visit, policy, _), weight in total.items():
+        if not math.isclose(weight, 1.0, abs_tol=1e-6):
+            raise ScoreError(
+                f"{session}/{visit}: the weights of {policy} add up to {weight:g}; expected 1",
+                hint="replay the recording again",
+            )
+
+
 def cumulative(
     trials: Sequence[Trial], *, pose: PoseName, part: Literal["position", "rotation"]
 ) -> tuple[Array, Array]:
@@ -312,8 +327,12 @@ def group(trials: Iterable[Trial], *, order: Sequence[str] = ()) -> dict[tuple[s
 def summarize(
     trials: Iterable[Trial], *, thresholds: Sequence[Threshold], pose: PoseName, order: Sequence[str] = ()
 ) -> tuple[Summary, ...]:
-    """Summarize trials per (policy, occlusion): recall at strict thresholds, intervals, weighted medians."""
-    summaries = []
+    """Summarize trials per (policy, occlusion): recall at strict thresholds, intervals, weighted medians.
+
+    Raises ScoreError when the weights of a policy at a visit do not add up to one.
+    """
+    trials, summaries = list(trials), []
+    check_weights(trials)
     for (policy, occlusion), rows in group(trials, order=order).items():
         n = len({(t.session, t.visit) for t in rows})
         recalls = tuple(recall(rows, threshold, pose=pose) for threshold in thresholds)

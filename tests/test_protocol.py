@@ -54,6 +54,17 @@ def test_a_minimal_protocol_takes_the_defaults(tmp_path: Path) -> None:
         (('name = "mine"', 'name = "mine"\nversion = 2'), "version 2; this fieldkit reads version 1"),
         (('name = "mine"', 'name = "mine'), "not valid TOML"),
         (("rotation_deg = 1.0", 'rotation_deg = "one"'), "Expected `float`, got `str`"),
+        (("rotation_deg = 1.0", "rotation_deg = inf"), r"the number at \$.thresholds\[0\].rotation_deg is not finite"),
+        (('name = "mine"', 'name = "mine"\nseed = -1'), r">= 0.*seed"),
+        (('name = "mine"', 'name = "mine"\nseed = 99999999999'), r"<.*seed"),
+        (('"max", "random"', ""), r"length >= 1.*policies"),
+        (("rotation_deg = 1.0", "rotation_deg = 1.0\n[occlusion]\nuse = []"), r"length >= 1.*occlusion.use"),
+        (("rotation_deg = 1.0", "rotation_deg = 1.0\n[candidates]\nkinds = []"), r"length >= 1.*candidates.kinds"),
+        (("rotation_deg = 1.0", "rotation_deg = 1.0\n[candidates]\nmin_distance_m = 9.0"), "expected less than"),
+        (
+            ("rotation_deg = 1.0", "rotation_deg = 1.0\n[candidates]\nforward_pitch_deg = nan"),
+            "not finite|forward_pitch",
+        ),
     ],
 )
 def test_a_mistake_is_named_with_file_and_place(tmp_path: Path, change: tuple[str, str], message: str) -> None:
@@ -61,10 +72,24 @@ def test_a_mistake_is_named_with_file_and_place(tmp_path: Path, change: tuple[st
         load_text(tmp_path, MINIMAL.replace(*change))
 
 
-def test_a_bound_at_a_threshold_that_is_not_scored_is_refused(tmp_path: Path) -> None:
-    bound = '[[expect]]\npolicy = "max"\nposition_m = 0.2\nrotation_deg = 1.0\n'
-    with pytest.raises(ProtocolError, match="not one of the protocol's thresholds"):
-        load_text(tmp_path, MINIMAL + bound)
+@pytest.mark.parametrize(
+    ("bound", "message"),
+    [
+        ('policy = "max"\nposition_m = 0.2', "not one of the protocol's thresholds"),
+        ('policy = "fim"\nposition_m = 0.1', "not one of the protocol's policies"),
+        ('policy = "max"\nposition_m = 0.1\nmin_recall = 2.0', "<= 1.0.*min_recall"),
+        ('policy = "max"\nposition_m = 0.1\nmin_recall = 0.9\nmax_recall = 0.1', "min_recall exceeds max_recall"),
+    ],
+)
+def test_a_bound_that_cannot_be_checked_is_refused(tmp_path: Path, bound: str, message: str) -> None:
+    with pytest.raises(ProtocolError, match=message):
+        load_text(tmp_path, f"{MINIMAL}[[expect]]\nrotation_deg = 1.0\n{bound}\n")
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_bytes(b"\xff\xfe\x00name")
+    with pytest.raises(ProtocolError, match=r"mine\.toml: cannot be read as text"):
+        protocol.load(tmp_path / "mine.toml")
 
 
 def test_an_unknown_name_is_refused_with_a_suggestion() -> None:

@@ -199,7 +199,8 @@ def test_existing_file_is_kept_unless_forced(run: Run, page: str, tmp_path: Path
 def test_report_that_fails_half_way_leaves_the_old_file(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "report.html"
     out.write_text("old")
-    torn = dataclasses.replace(run, trials=(*run.trials, dataclasses.replace(run.trials[0], cam_error=None)))  # type: ignore[arg-type]
+    torn_trial = dataclasses.replace(run.trials[0], cam_error=None)  # type: ignore[arg-type]
+    torn = dataclasses.replace(run, trials=(torn_trial, *run.trials[1:]))
     with pytest.raises(TypeError):
         write_report([torn], out, force=True)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

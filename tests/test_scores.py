@@ -353,3 +353,9 @@ def changed(protocol: Protocol, **changes: object) -> Protocol:
     """Return a protocol with some settings replaced."""
     values = {name: getattr(protocol, name) for name in protocol.__struct_fields__}
     return Protocol(**{**values, **changes})
+
+
+def test_weights_that_do_not_add_up_to_one_are_refused(rng: np.random.Generator) -> None:
+    rows = trials_of(make_visit(rng, "w01"))
+    with pytest.raises(ScoreError, match="the weights of stowed add up to 2; expected 1"):
+        summarize((*rows, rows[0]), thresholds=PROTOCOL.thresholds, pose=PROTOCOL.pose)
