@@ -108,6 +108,84 @@ def test_a_file_cannot_replace_a_folder(tmp_path: Path) -> None:
         store.atomic_write(tmp_path, "text")
 
 
+def out_of_reach(folder: Path, where: str) -> Path:
+    """Return a path at which not even root can write."""
+    (folder / "file").write_text("kept")
+    (folder / "link").symlink_to(folder / "nowhere")
+    places = {"below a file": folder / "file" / "a" / "out", "below a link": folder / "link" / "out"}
+    return {**places, "system": Path("/proc/out"), "long name": folder / ("x" * 300)}[where]
+
+
+REASONS = {
+    "below a file": "cannot be written: .*file is a file; expected a folder",
+    "below a link": "cannot be written: .*link is a link to nothing; expected a folder",
+    "system": "cannot be written: .*; expected a place that can be written to",
+}
+
+
+@pytest.mark.parametrize("where", REASONS)
+@pytest.mark.parametrize("kind", ["file", "folder", None])
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path, where: str, kind: object) -> None:
+    path = out_of_reach(tmp_path, where)
+    with pytest.raises(StoreError, match=f"out: {REASONS[where]}; choose another --out"):
+        store.refuse_existing(path, force=True, kind=kind)
+    with pytest.raises(StoreError, match=f"out: {REASONS[where]}"), store.atomic_folder(path):
+        pytest.fail("the work began")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "link"]
+
+
+@pytest.mark.parametrize("where", [*REASONS, "long name"])
+def test_a_file_or_a_cache_that_cannot_be_written_is_one_line(tmp_path: Path, where: str) -> None:
+    path = out_of_reach(tmp_path, where)
+    with pytest.raises(StoreError, match=f"{path.name}: cannot be written: .*; expected .*; choose another --out"):
+        store.atomic_write(path, "text")
+    with pytest.raises(StoreError, match=f"{path.name}: cannot be written: "):
+        store.EstimateCache(path).put("a", make_run().results[0].estimate)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "link"]
+
+
+def test_a_place_that_is_lost_during_the_work_is_named_and_nothing_is_left(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    out = tmp_path / "deep" / "out"
+    with pytest.raises(StoreError, match="out: cannot be written: No such file"), store.atomic_folder(out) as work:
+        work.rmdir()
+    assert list((tmp_path / "deep").iterdir()) == []
+
+
+def test_a_dangling_link_counts_as_existing(tmp_path: Path) -> None:
+    link = tmp_path / "out"
+    link.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(StoreError, match="out: exists already"):
+        store.refuse_existing(link, force=False)
+    with pytest.raises(StoreError, match=r"out: holds no run\.json"):
+        store.write_run(link, make_run(), force=True)
+    with store.atomic_folder(link, force=True) as work:
+        (work / "new.txt").write_text("new")
+    assert not link.is_symlink()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_file_takes_no_folder_s_place_and_a_folder_no_file_s(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(StoreError, match="folder: is a folder; expected a file"):
+        store.refuse_existing(tmp_path / "folder", force=True, kind="file")
+    with pytest.raises(StoreError, match="file: is a file; expected a folder"):
+        store.refuse_existing(tmp_path / "file", force=True, kind="folder")
+    store.refuse_existing(tmp_path / "file", force=True, kind="file")
+    store.refuse_existing(tmp_path / "folder", force=False, kind="folder")
+    with pytest.raises(StoreError, match="has no name of its own"):
+        store.refuse_existing(Path("."), force=False)
+
+
+def test_a_cache_that_cannot_be_read_is_named_and_garbage_is_ignored(tmp_path: Path) -> None:
+    (tmp_path / "cache").mkdir()
+    with pytest.raises(StoreError, match="cache: is a folder; expected a file"):
+        store.EstimateCache(tmp_path / "cache").get("a")
+    (tmp_path / "garbage").write_bytes(b"\xff\xfe\n5\n[]\n{}\n")
+    assert store.EstimateCache(tmp_path / "garbage").get("a") is None
+
+
 def test_a_folder_that_fails_half_way_leaves_the_old_one(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old.txt").write_text("old")

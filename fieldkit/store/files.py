@@ -13,7 +13,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -24,51 +24,69 @@ from fieldkit.errors import StoreError, suggestion
 T = TypeVar("T", bound=msgspec.Struct)
 
 
+@contextlib.contextmanager
+def saving(path: Path) -> Iterator[None]:
+    """Turn what the file system says against writing ``path`` into a StoreError that names it."""
+    try:
+        yield
+    except IsADirectoryError as error:
+        raise StoreError(f"{path}: is a folder; expected a file", hint="choose another --out") from error
+    except OSError as error:
+        # The names of temporary files say nothing; a folder above does.
+        above = None if error.filename is None else Path(os.fsdecode(error.filename))
+        place = f" ({above})" if above in Path(path).parents else ""
+        raise StoreError(
+            f"{path}: cannot be written: {error.strerror or error}{place}; expected a place that can be written to",
+            hint="choose another --out",
+        ) from error
+
+
 def atomic_write(path: Path, data: bytes | str) -> None:
-    """Write a file so that a reader or a killed process finds the old content or the new, never a part."""
+    """Write a file so that a reader or a killed process finds the old content or the new, never a part.
+
+    Raises StoreError when it cannot be written.
+    """
     path = Path(path)
     content = data.encode("utf-8") if isinstance(data, str) else data
-    try:
+    with saving(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be written: {error.strerror}", hint="choose another --out") from error
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except IsADirectoryError as error:
-        Path(name).unlink(missing_ok=True)
-        raise StoreError(f"{path}: is a folder; expected a file", hint="choose another --out") from error
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.chmod(name, 0o644)
+            os.replace(name, path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
 
 
 @contextlib.contextmanager
 def atomic_folder(path: Path, *, force: bool = False, marker: str | None = None) -> Iterator[Path]:
     """Yield an empty folder beside ``path`` that takes its place on success and vanishes on failure.
 
-    Raises StoreError as `refuse_existing` does, which is asked again before the folder is replaced.
+    Raises StoreError as `refuse_existing` does, which is asked again before the folder is replaced, or when the
+    folder cannot be made.
     """
     path = Path(path)
-    refuse_existing(path, force=force, marker=marker)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    refuse_existing(path, force=force, marker=marker, kind="folder")
+    with saving(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
         yield work
-        work.chmod(0o755)
-        refuse_existing(path, force=force, marker=marker)
-        _replace(work, path)
+        refuse_existing(path, force=force, marker=marker, kind="folder")
+        with saving(path):
+            work.chmod(0o755)
+            _replace(work, path)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
 
 def _replace(work: Path, path: Path) -> None:
-    if not path.exists():
+    if not os.path.lexists(path):
         work.rename(path)
         return
     # A folder cannot replace a full one in one step: the old one is kept aside until the new one stands.
@@ -83,21 +101,51 @@ def _replace(work: Path, path: Path) -> None:
         shutil.rmtree(old.parent, ignore_errors=True)
 
 
-def refuse_existing(path: Path, *, force: bool, marker: str | None = None) -> None:
-    """Raise StoreError when something stands at ``path`` and may not be replaced.
+def refuse_existing(
+    path: Path, *, force: bool, marker: str | None = None, kind: Literal["file", "folder"] | None = None
+) -> None:
+    """Raise StoreError when ``path`` cannot be written, or something stands there that may not be replaced.
 
-    An empty folder may be. With ``force`` anything may be that holds the file ``marker``, by which a folder of the
-    same kind is known: a mistyped --out never wipes a folder of something else.
+    Asked before the work starts, so that nobody waits for a result that has no place. An empty folder may be replaced
+    by a folder. With ``force`` anything of the same ``kind`` may be that holds the file ``marker``, by which a folder
+    of the same sort is known: a mistyped --out never wipes a folder of something else.
     """
     path = Path(path)
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        return
-    if not force:
-        raise StoreError(f"{path}: exists already", hint="give --force to replace it, or choose another --out")
-    if marker is not None and not (path / marker).is_file():
+    if path.name in ("", ".."):
+        raise StoreError(f"{path}: has no name of its own; expected a new name", hint="choose another --out")
+    with saving(path):
+        if not os.path.lexists(path):
+            _refuse_parent(path)
+            return
+        if kind is not None and path.exists() and path.is_dir() != (kind == "folder"):
+            found = "folder" if path.is_dir() else "file"
+            raise StoreError(f"{path}: is a {found}; expected a {kind}", hint="choose another --out")
+        if path.is_dir() and not any(path.iterdir()):
+            _refuse_parent(path)
+            return
+        if not force:
+            raise StoreError(f"{path}: exists already", hint="give --force to replace it, or choose another --out")
+        if marker is not None and not (path / marker).is_file():
+            raise StoreError(
+                f"{path}: holds no {marker}, so --force does not replace it", hint="remove it, or choose another --out"
+            )
+        _refuse_parent(path)
+
+
+def _refuse_parent(path: Path) -> None:
+    """Raise StoreError or OSError when nothing can be made in the nearest folder above ``path`` that exists."""
+    above = path.parent
+    while not os.path.lexists(above):
+        above = above.parent
+    if not above.is_dir():
+        found = "a file" if above.exists() else "a link to nothing"
         raise StoreError(
-            f"{path}: holds no {marker}, so --force does not replace it", hint="remove it, or choose another --out"
+            f"{path}: cannot be written: {above} is {found}; expected a folder", hint="choose another --out"
         )
+    # Trying is the only test that also knows read-only disks and folders in which not even root may write. The file
+    # has no name, where the file system can do that, and is gone when it is closed.
+    with tempfile.TemporaryFile(dir=above):
+        pass
 
 
 def digest(*parts: bytes | str | Path) -> str:

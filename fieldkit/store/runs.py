@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from pathlib import Path
 from typing import Any, Literal, cast
 from urllib.parse import quote, unquote
@@ -15,7 +16,7 @@ from fieldkit import protocol as protocols
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, StoreError
 from fieldkit.frames import Pose, pose
-from fieldkit.store.files import atomic_folder, atomic_write, plain_json, read_json
+from fieldkit.store.files import atomic_folder, atomic_write, plain_json, read_json, saving
 from fieldkit.store.inputs import write_tum
 from fieldkit.store.tables import (
     COVARIANCE,
@@ -307,7 +308,7 @@ class EstimateCache:
     """Estimates of an unfinished replay, one JSON line each, so that a second start does not localize again.
 
     ``path`` lies beside the run folder and is removed when the run is complete; lines that a killed process left
-    half-written are ignored.
+    half-written are ignored. Raises StoreError when the file cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -324,25 +325,30 @@ class EstimateCache:
         """Append an estimate and return it as a second start will read it, to the last bit."""
         # The line break in front ends a line that a kill may have cut off.
         line = "\n" + json.dumps({"key": key, **_estimate_plain(estimate)}) + "\n"
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(line)
+        with saving(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8") as stream:
+                stream.write(line)
         return _estimate_from_plain(_estimate_plain(estimate))
 
     def remove(self) -> None:
         """Remove the file: the run is complete."""
-        self.path.unlink(missing_ok=True)
+        with saving(self.path):
+            self.path.unlink(missing_ok=True)
 
     def _load(self) -> dict[str, Estimate]:
         known: dict[str, Estimate] = {}
-        if self.path.exists():
-            for line in self.path.read_text(encoding="utf-8").splitlines():
-                try:
-                    entry = json.loads(line)
-                    key = entry.pop("key")
-                    known[key] = _estimate_from_plain(entry)
-                except (ValueError, KeyError, TypeError, FieldkitError):
-                    continue
+        with saving(self.path):
+            if not os.path.lexists(self.path):
+                return known
+            text = self.path.read_text(encoding="utf-8", errors="replace")
+        for line in text.splitlines():
+            try:
+                entry = json.loads(line)
+                key = entry.pop("key")
+                known[key] = _estimate_from_plain(entry)
+            except (ValueError, KeyError, TypeError, AttributeError, FieldkitError):
+                continue
         return known
 
 
