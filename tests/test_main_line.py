@@ -21,6 +21,7 @@ from fieldkit.localize import Localizer
 from fieldkit.maps import content_digest
 from fieldkit.replay import replay
 from fieldkit.report import write_report
+from fieldkit.store.inputs import SessionFile, SessionView, SessionVisit
 from fieldkit.surface import read_ply, write_ply
 from fieldkit.types import Run
 
@@ -164,13 +165,13 @@ def test_what_cannot_be_scored_is_left_out_with_its_reason(tmp_path: Path, short
     visit = recording.visits[0]
     end_ns = visit.t_end_ns
     visits = [
-        store.SessionVisit("w01", visit.t_begin_ns, end_ns - 2, next="w02", truth_tag_id=visit.truth_tag_id),
-        store.SessionVisit("w02", end_ns - 1, end_ns, truth_tag_id=visit.truth_tag_id),
+        SessionVisit("w01", visit.t_begin_ns, end_ns - 2, next="w02", truth_tag_id=visit.truth_tag_id),
+        SessionVisit("w02", end_ns - 1, end_ns, truth_tag_id=visit.truth_tag_id),
     ]
-    views = [store.SessionView("w01", v.id, v.frame.t_ns, v.kind) for v in visit.views]
+    views = [SessionView("w01", v.id, v.frame.t_ns, v.kind) for v in visit.views]
     store.write_session(
         folder / "session.toml",
-        store.SessionFile("two", "robot.mcap", visit=tuple(visits), view=tuple(views)),
+        SessionFile("two", "robot.mcap", visit=tuple(visits), view=tuple(views)),
     )
     run = run_sample(tmp_path / "run", folder)
     assert {t.visit for t in run.trials} == {"w01"}

@@ -93,7 +93,7 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_is_refused_with_a_suggestion() -> None:
-    with pytest.raises(ProtocolError, match="unknown protocol 'paper_reel'.*did you mean 'paper_real'"):
+    with pytest.raises(ProtocolError, match=r"unknown protocol 'paper_reel'.*did you mean 'paper_real'"):
         protocol.load("paper_reel")
 
 
