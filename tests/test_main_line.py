@@ -157,7 +157,7 @@ def test_a_killed_replay_resumes_without_localizing_again(tmp_path: Path, short:
 
 
 def test_what_cannot_be_scored_is_left_out_with_its_reason(tmp_path: Path, short: Path) -> None:
-    """A second visit without any sweep view, in a session.toml beside the recording."""
+    """A second visit without any view, in a session.toml beside the recording."""
     folder = tmp_path / "session"
     folder.mkdir()
     shutil.copy(short, folder / "robot.mcap")
@@ -166,7 +166,7 @@ def test_what_cannot_be_scored_is_left_out_with_its_reason(tmp_path: Path, short
     end_ns = visit.t_end_ns
     visits = [
         SessionVisit("w01", visit.t_begin_ns, end_ns - 2, next="w02", truth_tag_id=visit.truth_tag_id),
-        SessionVisit("w02", end_ns - 1, end_ns, truth_tag_id=visit.truth_tag_id),
+        SessionVisit("w02", end_ns - 1, end_ns, truth_tag_id=3),
     ]
     views = [SessionView("w01", v.id, v.frame.t_ns, v.kind) for v in visit.views]
     store.write_session(
