@@ -21,9 +21,10 @@ def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     """Run the command line, expect status 1 and exactly one line of error; return it."""
     with pytest.raises(SystemExit) as stop:
         main([str(w) for w in words])
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("fieldkit: ")]
+    said = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    lines = [line for line in said if line.startswith("fieldkit: ")]
     assert stop.value.code == 1
-    assert len(lines) == 1
+    assert lines == said[-1:], said
     return lines[0]
 
 
