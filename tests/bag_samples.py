@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import sqlite3
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapFile
 
 from fieldkit.bags import BagFormat, Layout, RecordingWriter
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose, pose, yaw_pose
 from fieldkit.types import Image
 
+FORMATS: tuple[BagFormat, ...] = get_args(BagFormat)
+every_format = pytest.mark.parametrize("format", FORMATS)
 SUFFIXES: dict[BagFormat, str] = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
 T0 = 1_700_000_000_123_456_789
 STEP = 100_000_000
@@ -96,3 +102,28 @@ def write_sample(folder: Path, format: BagFormat, options: Options = Options(), 
             for t_ns, event in events:
                 writer.event(t_ns, event)
     return path
+
+
+def edited(folder: Path, *changes: str) -> None:
+    """Run SQL statements on the sqlite3 file of a ROS 2 recording."""
+    with sqlite3.connect(folder / f"{folder.name}.db3") as database:
+        for change in changes:
+            database.execute(change)
+    database.close()
+
+
+def rewritten(source: Path, target: Path, change: Callable[[str, bytes], bytes]) -> None:
+    """Copy an MCAP file message by message, passing every payload through ``change(topic, data)``."""
+    with source.open("rb") as stream, target.open("wb") as out:
+        writer = McapFile(out)
+        schemas: dict[str, int] = {}
+        channels: dict[str, int] = {}
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if channel.topic not in channels:
+                key = schemas.setdefault(schema.name, writer.register_schema(schema.name, schema.encoding, schema.data))
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", key)
+            data = change(channel.topic, message.data)
+            writer.add_message(channels[channel.topic], message.log_time, data, message.log_time)
+        writer.finish()

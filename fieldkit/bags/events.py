@@ -67,9 +67,9 @@ def find_marks(messages: Sequence[tuple[int, str]], session: SessionFile | None,
 
     An interval left open ends at the next begin, or at ``t_end_ns``. Events of unknown kind, and texts that are no
     JSON object with an "event", are counted in the warnings. Raises BagError for a known event that lacks a key, a
-    visit that begins twice, or a view of a visit that never begins.
+    visit that begins twice, a view of a visit that never begins, or a session.toml that contradicts itself.
     """
-    told = _from_session(session) if session else Marks()
+    told = _from_session(session, path) if session else Marks()
     replaced = {"start": bool(told.starts), "visit": bool(told.visits), "view": bool(told.views)}
     events, ignored = _decode(messages, path, skip=frozenset(kind for kind, given in replaced.items() if given))
     reader = _Reader(path)
@@ -87,7 +87,8 @@ def find_marks(messages: Sequence[tuple[int, str]], session: SessionFile | None,
     return marks
 
 
-def _from_session(session: SessionFile) -> Marks:
+def _from_session(session: SessionFile, path: Path) -> Marks:
+    _check_session(session, path)
     starts = tuple(Start(s.tag_id, s.t_begin_ns, s.t_end_ns, s.visit) for s in session.start)
     visits = tuple(VisitMark(v.id, v.t_begin_ns, v.t_end_ns, v.next, v.truth_tag_id) for v in session.visit)
     views = tuple(ViewMark(v.visit, v.id, v.kind, v.t_ns, v.repeat) for v in session.view)
@@ -97,6 +98,35 @@ def _from_session(session: SessionFile) -> Marks:
         if v.start is not None
     )
     return Marks(starts, _by_time(visits), tuple(sorted(views, key=lambda v: v.t_ns)), warnings)
+
+
+def _check_session(session: SessionFile, path: Path) -> None:
+    def refuse(what: str, expected: str, hint: str) -> BagError:
+        return BagError(f"{path}: session.toml has {what}; expected {expected}", hint=hint)
+
+    if not session.session.strip():
+        raise refuse("an empty session name", "a name", "give the session a name of its own")
+    names = {"visit": [v.id for v in session.visit], "view": [v.id for v in session.view]}
+    for kind, ids in names.items():
+        if any(not name.strip() for name in ids):
+            raise refuse(f"a {kind} with an empty id", "a name", f"give every {kind} an id")
+    twice = _first_twice(v.id for v in session.visit)
+    if twice is not None:
+        raise refuse(f"visit {twice!r} twice", "every visit once", "rename one of them, or remove it")
+    pair = _first_twice((v.visit, v.id) for v in session.view)
+    if pair is not None:
+        what = f"view {pair[1]!r} of visit {pair[0]!r} twice"
+        raise refuse(what, "every view of a visit once", "rename one of them, or remove it")
+    intervals = [(f"visit {v.id!r}", v.t_begin_ns, v.t_end_ns) for v in session.visit]
+    intervals += [(f"start {number}", s.t_begin_ns, s.t_end_ns) for number, s in enumerate(session.start, start=1)]
+    for name, begin, end in intervals:
+        if end < begin:
+            what = f"{name} that ends at {end} ns, before it begins at {begin} ns"
+            raise refuse(what, "t_begin_ns <= t_end_ns", "correct the times; both are bag time in ns")
+
+
+def _first_twice(items: Iterable[T]) -> T | None:
+    return next((item for item, count in Counter(items).items() if count > 1), None)
 
 
 def _by_time(visits: Iterable[VisitMark]) -> tuple[VisitMark, ...]:
@@ -187,7 +217,7 @@ class _Reader:
         return Marks(tuple(self._starts), _by_time(self._visits.values()), tuple(views), tuple(self.warnings))
 
     def _need(self, event: _Event, key: str, value: T | None) -> T:
-        if value is None:
+        if value is None or value == "":
             raise BagError(
                 f"{self.path}: event {event.event} without {key!r}; expected it in the JSON",
                 hint="write a session.toml beside the recording",
