@@ -9,7 +9,7 @@ import numpy as np
 from fieldkit.errors import FrameError, PriorError, TagError
 from fieldkit.frames import Array, Pose, Trajectory, compose_covariance
 from fieldkit.protocol import OdometryNoise
-from fieldkit.tags import body_in_map, body_sightings, fuse_sightings
+from fieldkit.tags import body_in_map, body_sightings, fuse_body_sightings
 from fieldkit.types import Prior, Recording, Start, TagMap, Visit
 
 # Standard deviations of a reference topic's pose where it gives the start
@@ -23,7 +23,8 @@ def estimate_prior(recording: Recording, visit: Visit, tags: TagMap, *, noise: O
 
     The start is the last one that names this visit, else the last one before it that names none. A start without a
     tag takes its pose from the recording's reference topic. The covariance has the tag's, the sightings' and the
-    odometry's noise; the hand-to-camera calibration and a warp of the map are not in it. Raises PriorError.
+    odometry's noise; the hand-to-camera calibration and a warp of the map are not in it. Raises PriorError, also where
+    the sightings contradict the kinematics.
     """
     what = f"{recording.path}: visit {visit.id}"
     start = _start(recording, visit, what)
@@ -126,14 +127,14 @@ def _from_tag(
     frames = [f for f in recording.frames if start.t_begin_ns <= f.t_ns <= start.t_end_ns]
     try:
         found = body_sightings(frames, tag, odometry=recording.odometry)
+        fix = fuse_body_sightings(found.sightings, tag) if found.sightings else None
     except TagError as error:
         raise PriorError(f"{what}: start tag {tag.id}: {error.message}", hint=error.hint) from error
-    if not found.sightings:
+    if fix is None:
         raise PriorError(
             f"{what}: start tag {tag.id} ({tag.family}) is never seen from {start.t_begin_ns} to {start.t_end_ns} ns: "
             f"{found.explanation}",
             hint="turn the arm camera to the tag at the start, or correct the interval, id or family",
         )
-    fix = fuse_sightings(found.sightings, tag.size_m)
     map_from_body, covariance = body_in_map(fix, tag)
     return found.t_ns, map_from_body, covariance, sum(fix.used)

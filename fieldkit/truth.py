@@ -8,8 +8,8 @@ import numpy as np
 
 from fieldkit.errors import FrameError, TagError, TruthError
 from fieldkit.frames import Array, compose_covariance
-from fieldkit.tags import ARM_COVARIANCE, body_in_map, body_sightings, fuse_sightings
-from fieldkit.types import Recording, TagMap, TagPose, Truth, Visit
+from fieldkit.tags import ARM_COVARIANCE, body_in_map, body_sightings, fuse_body_sightings
+from fieldkit.types import Frame, Recording, TagMap, TagPose, Truth, Visit
 
 # Standard deviations of a pose topic that states none: 5 mm and 0.2 deg per axis
 TOPIC_COVARIANCE: Array = np.diag([math.radians(0.2) ** 2] * 3 + [0.005**2] * 3)
@@ -21,10 +21,11 @@ def estimate_truths(
 ) -> dict[str, Truth]:
     """Estimate the true map_from_cam of the views of a visit, by view id; a view without kinematics is left out.
 
-    With a reference topic it gives the body. Otherwise all images of the visit that show its tripod tag are fused
-    into map_from_body; motion of the body within the visit is taken from odometry deltas. Neither the prior nor the
-    absolute odometry takes part. The covariance has the tag's, the corners' and the arm's noise; errors that all
-    images share (hand-to-camera calibration) and a warp of the map are not in it. Raises TruthError.
+    With a reference topic it gives the body. Otherwise the images of the views, and images of the visit's interval up
+    to MAX_IMAGES in all, are searched for its tripod tag and fused into map_from_body; motion of the body within the
+    visit is taken from odometry deltas. Neither the prior nor the absolute odometry takes part. The covariance has
+    the tag's, the corners' and the arm's noise; errors that all images share (hand-to-camera calibration) and a warp
+    of the map are not in it. Raises TruthError, also where the images contradict the kinematics.
     """
     what = f"{recording.path}: visit {visit.id}"
     if recording.reference is not None:
@@ -52,18 +53,16 @@ def _tag(visit: Visit, tags: TagMap, what: str) -> TagPose:
 
 def _from_tag(recording: Recording, visit: Visit, tag: TagPose, what: str) -> dict[str, Truth]:
     views = sorted(visit.views, key=lambda v: v.frame.t_ns)
-    standing = [f for f in recording.frames if visit.t_begin_ns <= f.t_ns <= visit.t_end_ns]
-    frames = [v.frame for v in views] or standing
     try:
-        found = body_sightings(frames, tag, odometry=recording.odometry, max_frames=MAX_IMAGES)
+        found = body_sightings(_frames(recording, visit), tag, odometry=recording.odometry, max_frames=MAX_IMAGES)
+        fix = fuse_body_sightings(found.sightings, tag) if found.sightings else None
     except TagError as error:
         raise TruthError(f"{what}: tripod tag {tag.id}: {error.message}", hint=error.hint) from error
-    if not found.sightings:
+    if fix is None:
         raise TruthError(
             f"{what}: tripod tag {tag.id} ({tag.family}) is never seen: {found.explanation}",
             hint="turn the arm camera to the tag at every waypoint, or correct its id or family",
         )
-    fix = fuse_sightings(found.sightings, tag.size_m)
     map_from_ref, covariance = body_in_map(fix, tag)
     ref_from_odom = recording.odometry.at(found.t_ns).inv()
     truths = {}
@@ -84,6 +83,16 @@ def _from_tag(recording: Recording, visit: Visit, tag: TagPose, what: str) -> di
                 "tag",
             )
     return truths
+
+
+def _frames(recording: Recording, visit: Visit) -> list[Frame]:
+    """Return the frames to search: those of the views, and from the visit's interval up to MAX_IMAGES in all."""
+    # Views first: the arm may turn to the tag for no more than one announced image
+    chosen = {v.frame.t_ns: v.frame for v in visit.views}
+    between = [f for f in recording.frames if visit.t_begin_ns <= f.t_ns <= visit.t_end_ns and f.t_ns not in chosen]
+    room = min(max(MAX_IMAGES - len(chosen), 0), len(between))
+    chosen |= {between[i].t_ns: between[i] for i in np.linspace(0, len(between) - 1, room).astype(int)}
+    return [chosen[t_ns] for t_ns in sorted(chosen)]
 
 
 def _from_topic(recording: Recording, visit: Visit, body_covariance: Array, what: str) -> dict[str, Truth]:

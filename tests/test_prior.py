@@ -146,6 +146,27 @@ def test_what_is_missing_is_named(rng: np.random.Generator) -> None:
         estimate_prior(dataclasses.replace(recording, frames=no_arm), visit, robot.tags, noise=NOISE)
 
 
+def test_a_start_whose_kinematics_are_broken_is_no_prior(rng: np.random.Generator) -> None:
+    robot = stand_and_look(rng=rng)
+    frames = tuple(
+        dataclasses.replace(f, body_from_cam=f.body_from_cam * exp(rng.normal(0, [0.05] * 3 + [0.08] * 3)))
+        for f in robot.recording.frames
+    )
+    message = (
+        r"s\.mcap: visit w01: .*the 6 sightings of tag 1 disagree with kinematics by about 5 times their stated noise "
+        r"or more; .*; check size_m of the tag, camera_info and tf"
+    )
+    with pytest.raises(PriorError, match=message):
+        estimate_prior(dataclasses.replace(robot.recording, frames=frames), robot.visit, robot.tags, noise=NOISE)
+
+
+def test_sightings_without_a_solution_are_named(rng: np.random.Generator) -> None:
+    robot = stand_and_look(rng=rng)
+    tags = tuple(dataclasses.replace(t, size_m=1e-160) for t in robot.tags.tags)
+    with pytest.raises(PriorError, match=r"s\.mcap: visit w01: start tag 1: .*its corners fit no pose"):
+        estimate_prior(robot.recording, robot.visit, dataclasses.replace(robot.tags, tags=tags), noise=NOISE)
+
+
 def test_a_gap_in_the_odometry_is_named(rng: np.random.Generator) -> None:
     robot = stand_and_look(rng=rng)
     whole = robot.recording.odometry

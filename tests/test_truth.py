@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tag_scenes import AT_VISIT, SECOND, Robot, stand_and_look
+from tag_scenes import AT_VISIT, SECOND, VGA, Robot, stand_and_look
 
 from fieldkit.errors import TruthError
 from fieldkit.frames import Pose, Trajectory, exp, log, pose_error, yaw_pose
 from fieldkit.tags import TagFix, body_in_map
-from fieldkit.truth import estimate_truths
-from fieldkit.types import Recording, Truth, Visit
+from fieldkit.truth import MAX_IMAGES, estimate_truths
+from fieldkit.types import Frame, Recording, Truth, Visit
 
 
 def truths_of(robot: Robot) -> dict[str, Truth]:
@@ -92,6 +92,55 @@ def test_an_error_of_the_tag_in_the_map_is_within_the_stated_covariance() -> Non
     assert 0.3 < np.mean(squared) < 2.0
 
 
+def test_images_between_the_views_show_the_tag_too_and_only_those_of_the_visit(rng: np.random.Generator) -> None:
+    robot = stand_and_look(rng=rng)
+    recording, visit = with_views(robot, robot.visit.views[5:])
+    (truth,) = estimate_truths(recording, visit, robot.tags).values()
+    assert pose_error(truth.map_from_cam, AT_VISIT * visit.views[0].frame.body_from_cam)[0] < 0.01
+    late = dataclasses.replace(visit, t_begin_ns=20 * SECOND)
+    with pytest.raises(TruthError, match="is never seen: 1 images searched"):
+        estimate_truths(recording, late, robot.tags)
+
+
+def test_of_a_long_visit_every_view_and_a_bounded_number_of_other_images_is_searched(rng: np.random.Generator) -> None:
+    robot = stand_and_look(rng=rng)
+    blind, seen = robot.visit.views[5].frame, robot.visit.views[2]
+    reads: list[int] = []
+
+    def counted(t_ns: int, frame: Frame) -> Frame:
+        return dataclasses.replace(frame, t_ns=t_ns, read=lambda: (reads.append(t_ns), blank)[1])
+
+    blank = np.full((VGA.height, VGA.width), 128, np.uint8)
+    many = tuple(counted(15 * SECOND + 10_000_000 * i, blind) for i in range(1000))
+    recording, visit = with_views(robot, (seen,))
+    truths = estimate_truths(dataclasses.replace(recording, frames=many), visit, robot.tags)
+    assert sorted(truths) == ["02"]
+    # The view itself is one of them, and its own frame counts rather than another one with its stamp
+    assert len(reads) == len(set(reads)) == MAX_IMAGES - 1
+    assert min(reads) < 15.1 * SECOND < 24.9 * SECOND < max(reads)
+
+
+def test_a_wrong_tag_size_is_no_truth(rng: np.random.Generator) -> None:
+    robot = stand_and_look(rng=rng)
+    tags = tuple(dataclasses.replace(t, size_m=0.2) for t in robot.tags.tags)
+    message = (
+        r"s\.mcap: visit w01: .*the 5 sightings of tag 2 disagree with kinematics by about 5 times their stated noise "
+        r"or more; .*; check size_m of the tag, camera_info and tf"
+    )
+    with pytest.raises(TruthError, match=message):
+        estimate_truths(robot.recording, robot.visit, dataclasses.replace(robot.tags, tags=tags))
+
+
+@pytest.mark.parametrize(
+    ("size_m", "message"), [(1e-6, "the 5 sightings of tag 2 determine no pose"), (1e-160, "its corners fit no pose")]
+)
+def test_sightings_without_a_solution_are_named(rng: np.random.Generator, size_m: float, message: str) -> None:
+    robot = stand_and_look(rng=rng)
+    tags = tuple(dataclasses.replace(t, size_m=size_m) for t in robot.tags.tags)
+    with pytest.raises(TruthError, match=rf"s\.mcap: visit w01: tripod tag 2: .*{message}"):
+        estimate_truths(robot.recording, robot.visit, dataclasses.replace(robot.tags, tags=tags))
+
+
 def test_one_image_with_wrong_kinematics_does_not_move_the_truth(rng: np.random.Generator) -> None:
     robot = stand_and_look(rng=rng)
     first, *rest = robot.visit.views
@@ -135,8 +184,9 @@ def test_what_is_missing_is_named(rng: np.random.Generator) -> None:
     with pytest.raises(TruthError, match="names no tripod tag"):
         estimate_truths(robot.recording, unnamed, robot.tags)
     recording, blind = with_views(robot, robot.visit.views[5:])
+    unseen = dataclasses.replace(recording, frames=(blind.views[0].frame,))
     with pytest.raises(TruthError, match=r"tripod tag 2 \(tag36h11\) is never seen: 1 images searched"):
-        estimate_truths(recording, blind, robot.tags)
+        estimate_truths(unseen, blind, robot.tags)
     ended = Trajectory(np.array([0, 1]), (AT_VISIT, AT_VISIT), "map", "body")
     with pytest.raises(TruthError, match="no view has a pose of the reference topic"):
         estimate_truths(dataclasses.replace(robot.recording, reference=ended), robot.visit, robot.tags)

@@ -4,7 +4,7 @@ from fieldkit.tags.detect import FAMILIES, TagDetection, detect
 from fieldkit.tags.drawing import draw_tag
 from fieldkit.tags.fusion import Sighting, TagFix, fuse_sightings
 from fieldkit.tags.pose import TagSolution, solve, tag_corners
-from fieldkit.tags.sightings import ARM_COVARIANCE, BodySightings, body_in_map, body_sightings
+from fieldkit.tags.sightings import ARM_COVARIANCE, BodySightings, body_in_map, body_sightings, fuse_body_sightings
 
 __all__ = [
     "ARM_COVARIANCE",
@@ -18,6 +18,7 @@ __all__ = [
     "body_sightings",
     "detect",
     "draw_tag",
+    "fuse_body_sightings",
     "fuse_sightings",
     "solve",
     "tag_corners",

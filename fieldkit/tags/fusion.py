@@ -21,6 +21,8 @@ Mask = NDArray[np.bool_]
 GATE = 40.0
 # Difference of two solutions' chi-square below which neither is certain: odds of e^10
 CERTAIN = 20.0
+# What the stated noise of the cameras may be multiplied by
+SCALES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,9 +66,7 @@ class TagFix:
         return self.evidence > CERTAIN and tilt_is_known(self.covariance)
 
 
-def fuse_sightings(
-    sightings: Sequence[Sighting], size_m: float, *, scales: Sequence[float] = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-) -> TagFix:
+def fuse_sightings(sightings: Sequence[Sighting], size_m: float, *, scales: Sequence[float] = SCALES) -> TagFix:
     """Fuse sightings of one tag of edge ``size_m`` into ref_from_tag.
 
     Both planar solutions of every sighting vote for a consensus; then one generalised least-squares problem over all
@@ -75,10 +75,21 @@ def fuse_sightings(
     eliminating them. The camera noise may be multiplied by one of ``scales``, the most likely one (from 4 sightings
     on). The covariance is scaled by chi-square per degree of freedom where that exceeds 1. Errors that all sightings
     share (hand-to-camera calibration, tag size, a warp of the map) are not in it.
-    Raises TagError when there is no sighting.
+    Raises TagError when there is no sighting, or no pose that explains them.
     """
     if not sightings:
         raise TagError("no sighting of the tag; expected at least one")
+    try:
+        return _fuse(sightings, size_m, scales)
+    except np.linalg.LinAlgError as error:
+        raise TagError(
+            f"the {len(sightings)} sightings of tag {sightings[0].detection.id} determine no pose ({error}); expected "
+            f"the corners of a square of {size_m:g} m",
+            hint="check size_m of the tag and the camera's calibration",
+        ) from error
+
+
+def _fuse(sightings: Sequence[Sighting], size_m: float, scales: Sequence[float]) -> TagFix:
     points = tag_corners(size_m)
     problem = _Problem.of(sightings, points)
     solutions = [solve(s.detection, s.camera, size_m) for s in sightings]

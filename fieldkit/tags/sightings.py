@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fieldkit.errors import FrameError
+from fieldkit.errors import FrameError, TagError
 from fieldkit.frames import Array, Pose, Trajectory, compose_covariance, inverse_covariance
 from fieldkit.tags.detect import detect
-from fieldkit.tags.fusion import Sighting, TagFix
+from fieldkit.tags.fusion import SCALES, Sighting, TagFix, fuse_sightings
 from fieldkit.types import Frame, TagPose
 
 # Noise of body_from_cam from joint angles, independent between images: 0.2 deg and 2 mm per axis. The fusion scales it
@@ -73,6 +73,22 @@ def body_sightings(
             ref_from_cam = ref_from_odom * odom_from_body * body_from_cam
             sightings.append(Sighting(seen[0], frame.camera, ref_from_cam, ARM_COVARIANCE))
     return BodySightings(reference, tuple(sightings), len(chosen), no_kinematics, no_odometry, last_error)
+
+
+def fuse_body_sightings(sightings: Sequence[Sighting], tag: TagPose) -> TagFix:
+    """Fuse what a robot's own camera saw of one tag into body_from_tag; see `fuse_sightings`.
+
+    Raises TagError when there is no solution, or when four or more sightings need the largest noise of the arm that
+    is allowed: a wrong tag size or wrong kinematics shifts all of them, and the covariance would not tell.
+    """
+    fix = fuse_sightings(sightings, tag.size_m)
+    if len(sightings) >= 4 and fix.scale >= max(SCALES):
+        raise TagError(
+            f"the {len(sightings)} sightings of tag {tag.id} disagree with kinematics by about {max(SCALES):g} times "
+            "their stated noise or more; expected one place of the tag in all of them",
+            hint="check size_m of the tag, camera_info and tf",
+        )
+    return fix
 
 
 def body_in_map(fix: TagFix, tag: TagPose) -> tuple[Pose, Array]:
