@@ -255,6 +255,41 @@ def test_a_damaged_map_is_named(tmp_path: Path, rng: np.random.Generator, damage
         load_map(path)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("voxel_m = 0.05", "voxel_m = 0.1", r"map\.toml: surface\.voxel_m is 0\.1; expected 0\.05 as in surface\.ply"),
+        ("voxel_m = 0.05", "voxel_m = nan", r"surface\.voxel_m is nan; expected a positive number"),
+        ("voxel_m = 0.05", "voxel_m = 0.0", r"surface\.voxel_m is 0; expected a positive number"),
+        ("truncation_m = 0.14", "truncation_m = inf", r"surface\.truncation_m is inf; expected a positive number"),
+        ("\nscale = 1.0", "\nscale = -1.0", r"alignment\.scale is -1; expected a positive number"),
+        ("rms_m = 0.0", "rms_m = nan", r"alignment\.rms_m is nan; expected a finite number"),
+        ('"surface.ply"', '"../other.ply"', r"map\.toml: .*other\.ply"),
+        ('[surface]\nvoxel_m = 0.05\ntruncation_m = 0.14\nfile = "surface.ply"\n', "", r"has no \[surface\]"),
+    ],
+)
+def test_numbers_of_a_map_that_no_digest_covers_cannot_change_results(
+    tmp_path: Path, rng: np.random.Generator, old: str, new: str, message: str
+) -> None:
+    path = tmp_path / "room.map"
+    surface = Surface(np.eye(3), np.array([[0, 1, 2]], dtype=np.int32), 0.05)
+    write_map(path, make_map(rng, n_landmarks=50, n_images=4), surface=surface)
+    assert old in (path / "map.toml").read_text()
+    _replace(path / "map.toml", old, new)
+    with pytest.raises(FieldkitError, match=message):
+        load_map(path)
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, float("nan"), float("inf")])
+def test_a_voxel_without_size_fails_before_any_work(tmp_path: Path, rng: np.random.Generator, value: float) -> None:
+    with pytest.raises(MapError, match=r"voxel_m is .*; expected a positive number; choose another voxel_m"):
+        MapOptions(voxel_m=value)
+    write_map(tmp_path / "room.map", make_map(rng, n_landmarks=50, n_images=4))
+    with pytest.raises(MapError, match=r"voxel_m is .*; expected a positive number"):
+        compact_map(tmp_path / "room.map", tmp_path / "small.map", voxel_m=value)
+    assert [p.name for p in tmp_path.iterdir()] == ["room.map"]
+
+
 def test_a_missing_map_is_named(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"none\.map: no such folder"):
         load_map(tmp_path / "none.map")
@@ -283,6 +318,9 @@ def image_folder(path: Path, n: int = 4) -> Path:
         (lambda p: (p / "camera.toml").unlink(), "camera.toml: no such file"),
         (lambda p: (p / "poses.txt").unlink(), "poses.txt: no such file; expected SLAM poses"),
         (lambda p: (p / "poses.txt").write_text("000 1 2\n"), "line 1"),
+        (lambda p: write_tum(p / "poses.txt", [(n, Pose.identity()) for n in "abcd"]),
+         r"poses\.txt: names 0 of the 4 images; expected at least 3"),
+        (lambda p: [(p / "images" / f"00{i}.png").unlink() for i in (0, 1)], "names 2 of the 2 images"),
         (lambda p: (p / "images" / "001.png").write_bytes(b"broken"), "001.png: cannot be read"),
         (lambda p: cv2.imwrite(str(p / "images" / "002.png"), np.zeros((30, 40), np.uint8)), "002.png: is 40x30"),
         (lambda p: shutil.copy(p / "images" / "001.png", p / "images" / "001.jpg"), "have one name"),
@@ -335,6 +373,16 @@ def test_an_existing_map_is_not_replaced_unasked(tmp_path: Path) -> None:
     with pytest.raises(MapError):
         build_map(source, tmp_path / "old.map", force=True)
     assert (tmp_path / "old.map" / "map.toml").read_text() == "old"
+
+
+def test_a_rig_walk_with_the_poses_of_another_is_named(tmp_path: Path) -> None:
+    write_rig(tmp_path / "rig.toml", Rig((RigCamera("lf", CAMERA, Pose.identity()),)))
+    (tmp_path / "images" / "lf").mkdir(parents=True)
+    for i in range(5):
+        cv2.imwrite(str(tmp_path / "images" / "lf" / f"{i:06d}.png"), np.zeros((640, 480), dtype=np.uint8))
+    write_tum(tmp_path / "slam_poses.txt", [(f"{i:06d}", Pose.identity()) for i in range(3, 9)])
+    with pytest.raises(MapError, match=r"slam_poses\.txt: names 2 of the 5 images; expected at least 3"):
+        read_source(tmp_path)
 
 
 @pytest.fixture(scope="module")

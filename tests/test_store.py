@@ -189,9 +189,14 @@ def test_a_cache_that_cannot_be_read_is_named_and_garbage_is_ignored(tmp_path: P
 def test_a_folder_that_fails_half_way_leaves_the_old_one(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old.txt").write_text("old")
-    with pytest.raises(RuntimeError), store.atomic_folder(tmp_path / "out", force=True) as work:
-        (work / "new.txt").write_text("new")
-        raise RuntimeError
+
+    def fail_half_way() -> None:
+        with store.atomic_folder(tmp_path / "out", force=True) as work:
+            (work / "new.txt").write_text("new")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_half_way()
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["old.txt"]
 

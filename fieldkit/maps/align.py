@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
+from fieldkit.maps.source import MIN_POSES
 
 Array = NDArray[np.float64]
 Verdict = Literal["pass", "warn", "fail"]
 
 # Below this no camera is called an outlier, however well the others fit: SLAM and SfM both are that uncertain.
 _MIN_THRESHOLD_M = 0.05
-_MIN_POSES = 3
 # Threshold in median residuals: a steady drift is kept whole, positions that are plainly wrong are left out.
 _WIDTH = 4.0
 # Tilt between SLAM's up and the map's that is levelled; more means that one of the two is wrong.
@@ -98,7 +98,7 @@ def robust_similarity(source: Array, target: Array, *, rng: np.random.Generator)
     kept = np.zeros(len(source), dtype=bool)
     for _ in range(30):
         now = np.linalg.norm(best.points(source) - target, axis=1) <= threshold
-        if (now == kept).all() or now.sum() < _MIN_POSES:
+        if (now == kept).all() or now.sum() < MIN_POSES:
             break
         kept = now
         best = umeyama(source[kept], target[kept])
@@ -114,9 +114,9 @@ def align_to_slam(sfm_from_cam: Sequence[Pose], slam_from_cam: Sequence[Pose], *
     its cameras agrees with SLAM's, which knows gravity better than its drifting heights do.
     Raises MapError when fewer than three cameras have SLAM poses or they stand on one spot.
     """
-    if len(sfm_from_cam) < _MIN_POSES:
+    if len(sfm_from_cam) < MIN_POSES:
         raise MapError(
-            f"{len(sfm_from_cam)} mapped images have a SLAM pose; expected at least {_MIN_POSES}",
+            f"{len(sfm_from_cam)} mapped images have a SLAM pose; expected at least {MIN_POSES}",
             hint="check that the names of the poses are those of the images",
         )
     source = np.stack([p.translation for p in sfm_from_cam])

@@ -18,10 +18,18 @@ from fieldkit.errors import MapError, SurfaceError
 from fieldkit.features import Features, extract, feature_kind, read_grey
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
-from fieldkit.maps.io import AlignmentEntry, MapFile, SurfaceEntry, content_digest, write_features, write_map_file
+from fieldkit.maps.io import (
+    AlignmentEntry,
+    MapFile,
+    SurfaceEntry,
+    content_digest,
+    positive,
+    write_features,
+    write_map_file,
+)
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
 from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
-from fieldkit.maps.pairs import choose_pairs, match_pairs
+from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
 from fieldkit.maps.rigs import contradicting
 from fieldkit.maps.sfm import reconstruct, threads
 from fieldkit.maps.source import DepthFrame, MapSource, read_source
@@ -38,6 +46,7 @@ class MapOptions:
     """Settings of map building; the defaults suit 50..500 images of rooms.
 
     ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
+    Raises MapError when a length or a count is not positive.
     """
 
     max_keypoints: int = 2048
@@ -51,6 +60,10 @@ class MapOptions:
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
+
+    def __post_init__(self) -> None:
+        for name in ("voxel_m", "truncation_voxels", "max_depth_m", "ratio", "max_keypoints"):
+            positive(name, getattr(self, name))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,58 +108,37 @@ def build_map(
 
     Only images go into SfM; SLAM poses give scale, frame and gravity afterwards, and depth images refine the scale.
     The same source and seed give the same map, whatever the number of processors.
-    ``progress(step, done, total)`` is called along the way. Raises
-    MapError when the source is incomplete, too few images register, or the poses do not fit; nothing is left behind.
+    ``progress(step, done, total)`` is called along the way. Raises MapError when the source is incomplete, too few
+    images register, or the poses do not fit, and StoreError when ``out`` is in the way; nothing is left behind.
     """
     options = MapOptions() if options is None else options
     tell: Progress = progress or (lambda step, done, total: None)
     feature_kind(feature)
-    refuse_existing(Path(out), force=force, marker="map.toml")
+    refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
     clock = _Clock()
     walk = read_source(Path(source))
     features = _extract_all(walk, feature, options, tell)
     clock.lap("extract")
-    pairs = choose_pairs(
-        walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
-    )
-    matches = match_pairs(
-        pairs, features, ratio=options.ratio, progress=lambda n: tell("match", n, len(pairs)), n_threads=threads()
-    )
+    pairs, matches = _match_all(walk, features, options, seed, tell)
     clock.lap("match")
     model = reconstruct(walk.images, features, pairs, matches, seed=seed, progress=tell)
     clock.lap("reconstruct")
     sfm_poses = _registered(walk, model, options)
-    alignment, warnings = _align(walk, sfm_poses, seed)
-    if options.scale == "auto":
-        alignment, doubts = _scale_by_depth(walk, model, sfm_poses, alignment)
-        warnings += doubts
-    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
-    for i in contradicting(walk.images, mapped):
-        warnings.append(f"{walk.images[i].name} left out: its pose contradicts the rig")
-        model.deregister_frame(i + 1)
-        del mapped[i]
+    alignment, warnings = _align(walk, model, sfm_poses, options, seed)
+    mapped, left_out = _placed(walk, model, sfm_poses, alignment)
     n_landmarks = _finish_model(walk, model, alignment.map_from_sfm, options.landmarks)
     clock.lap("align")
     surface, missing = _surface(walk, mapped, options, tell)
     clock.lap("surface")
+    counts = (len(walk.images), len(mapped), n_landmarks)
     with atomic_folder(Path(out), force=force, marker="map.toml") as folder:
         _write(folder, walk, model, features, mapped, surface)
-        entry = MapFile(
-            1,
-            content_digest(folder),
-            feature,
-            len(walk.images),
-            len(mapped),
-            n_landmarks,
-            _alignment_entry(alignment),
-            _surface_entry(surface, options),
-        )
-        write_map_file(folder, entry)
+        digest = content_digest(folder)
+        places = _alignment_entry(alignment), _surface_entry(surface, options)
+        write_map_file(folder, MapFile(1, digest, feature, *counts, *places))
     clock.lap("write")
-    return MapReport(
-        str(out), entry.digest, len(walk.images), len(mapped), n_landmarks, alignment, surface is not None,
-        clock.seconds, (*warnings, *missing),
-    )  # fmt: skip
+    found = (*warnings, *left_out, *missing)
+    return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, found)
 
 
 def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progress) -> list[Features]:
@@ -169,6 +161,18 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
     return found
 
 
+def _match_all(
+    walk: MapSource, features: list[Features], options: MapOptions, seed: int, tell: Progress
+) -> tuple[list[Pair], list[NDArray[np.uint32]]]:
+    pairs = choose_pairs(
+        walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
+    )
+    matches = match_pairs(
+        pairs, features, ratio=options.ratio, progress=lambda n: tell("match", n, len(pairs)), n_threads=threads()
+    )
+    return pairs, matches
+
+
 def _registered(walk: MapSource, model: pycolmap.Reconstruction, options: MapOptions) -> dict[int, Pose]:
     """Return sfm_from_cam by image index; raises MapError when too few images are in the model."""
     poses = {}
@@ -183,7 +187,10 @@ def _registered(walk: MapSource, model: pycolmap.Reconstruction, options: MapOpt
     return dict(sorted(poses.items()))
 
 
-def _align(walk: MapSource, sfm_poses: Mapping[int, Pose], seed: int) -> tuple[Alignment, list[str]]:
+def _align(
+    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], options: MapOptions, seed: int
+) -> tuple[Alignment, list[str]]:
+    """Return map_from_sfm by the SLAM poses, scaled by depth unless told otherwise, and what a user should know."""
     posed = {i: p for i in sfm_poses if (p := walk.images[i].slam_from_cam) is not None}
     try:
         alignment = align_to_slam([sfm_poses[i] for i in posed], list(posed.values()), seed=seed)
@@ -197,7 +204,10 @@ def _align(walk: MapSource, sfm_poses: Mapping[int, Pose], seed: int) -> tuple[A
             f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} SLAM poses within "
             f"{alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
         )
-    return alignment, warnings
+    if options.scale == "slam":
+        return alignment, warnings
+    scaled, doubts = _scale_by_depth(walk, model, sfm_poses, alignment)
+    return scaled, warnings + doubts
 
 
 def _scale_by_depth(
@@ -220,6 +230,19 @@ def _scale_by_depth(
         sfm_centres=np.stack([sfm_poses[i].translation for i in posed]),
         slam_centres=np.stack([p.translation for p in posed.values()]),
     )
+
+
+def _placed(
+    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], alignment: Alignment
+) -> tuple[dict[int, Pose], list[str]]:
+    """Return map_from_cam by image index; images that contradict the rig leave the model, with a warning each."""
+    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
+    left_out = []
+    for i in contradicting(walk.images, mapped):
+        left_out.append(f"{walk.images[i].name} left out: its pose contradicts the rig")
+        model.deregister_frame(i + 1)
+        del mapped[i]
+    return mapped, left_out
 
 
 def _finish_model(

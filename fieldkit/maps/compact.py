@@ -9,15 +9,9 @@ from numpy.typing import NDArray
 
 from fieldkit.errors import MapError
 from fieldkit.features import Features
-from fieldkit.maps.io import (
-    content_digest,
-    load_map,
-    read_map_file,
-    write_features,
-    write_map_file,
-)
+from fieldkit.maps.io import content_digest, load_map, positive, read_map_file, write_features, write_map_file
 from fieldkit.maps.landmarks import Model, model_from_arrays
-from fieldkit.store import atomic_folder
+from fieldkit.store import atomic_folder, refuse_existing
 from fieldkit.surface import coarsen, write_ply
 from fieldkit.types import SceneMap
 
@@ -30,8 +24,10 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
 
     Only keypoints that observe a landmark stay; of a landmark's descriptors the one nearest to their mean stays and
     the others become zero; the surface is merged to ``voxel_m``. It is a map of its own, with its own digest.
-    Raises MapError when the map's descriptors are not 8-bit.
+    Raises MapError when the map's descriptors are not 8-bit or ``voxel_m`` is no size.
     """
+    refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
+    positive("voxel_m", voxel_m)
     scene_map, entry = load_map(Path(path)), read_map_file(Path(path))
     if scene_map.descriptors.dtype != np.uint8:
         raise MapError(f"{path}: {scene_map.feature} descriptors are not 8-bit", hint="compact a map of feature sift")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -42,7 +42,7 @@ class SurfaceEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     voxel_m: float
     truncation_m: float
-    file: str
+    file: Literal["surface.ply"]
 
 
 class MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,6 +103,12 @@ def read_features(path: Path, names: tuple[str, ...]) -> dict[str, tuple[NDArray
     return result
 
 
+def positive(name: str, value: float) -> None:
+    """Raise MapError unless a setting is a finite number above zero."""
+    if not (math.isfinite(value) and value > 0):
+        raise MapError(f"{name} is {value:g}; expected a positive number", hint=f"choose another {name}")
+
+
 def content_digest(folder: Path) -> str:
     """Return the digest over model, features and surface of a map folder."""
     files = [*(folder / "sparse" / name for name in _MODEL_FILES), folder / "features.h5", folder / "surface.ply"]
@@ -120,7 +126,23 @@ def read_map_file(path: Path) -> MapFile:
         raise MapError(f"{path}: no such folder; expected a map folder", hint="build one with `fieldkit map build`")
     if not (path / "map.toml").is_file():
         raise MapError(f"{path}: no map.toml in it; expected a map folder", hint="build one with `fieldkit map build`")
-    return read_toml(path / "map.toml", MapFile, what="map.toml of fieldkit")
+    entry = read_toml(path / "map.toml", MapFile, what="map.toml of fieldkit")
+    _refuse_wrong_numbers(path / "map.toml", entry)
+    return entry
+
+
+def _refuse_wrong_numbers(path: Path, entry: MapFile) -> None:
+    a, s = entry.alignment, entry.surface
+    sizes = {"alignment.scale": a.scale}
+    if s is not None:
+        sizes |= {"surface.voxel_m": s.voxel_m, "surface.truncation_m": s.truncation_m}
+    measured = {"alignment.rms_m": a.rms_m, "alignment.p95_m": a.p95_m, "alignment.gravity_deg": a.gravity_deg}
+    for name, value in {**sizes, **measured}.items():
+        if not math.isfinite(value) or value < 0 or (value == 0 and name in sizes):
+            raise MapError(
+                f"{path}: {name} is {value:g}; expected a {'positive' if name in sizes else 'finite'} number",
+                hint="copy or build the map again",
+            )
 
 
 def load_map(path: Path) -> SceneMap:
@@ -185,6 +207,11 @@ def _refuse_changed(path: Path, entry: MapFile) -> None:
             f"{path}: its files have another digest than map.toml names ({entry.digest}); they are damaged or changed",
             hint="copy or build the map again",
         )
+    if entry.surface is None and (path / "surface.ply").exists():
+        raise MapError(
+            f"{path / 'map.toml'}: has no [surface]; expected it, since there is a surface.ply",
+            hint="copy or build the map again",
+        )
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
@@ -199,9 +226,17 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
 
 
 def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
+    """Return the surface; its voxel size is that of the digested mesh file, with which map.toml has to agree."""
     if entry is None:
         return None
-    return dataclasses.replace(read_ply(path / entry.file), voxel_m=entry.voxel_m)
+    surface = read_ply(path / entry.file)
+    if not math.isclose(surface.voxel_m, entry.voxel_m, rel_tol=1e-6):
+        raise MapError(
+            f"{path / 'map.toml'}: surface.voxel_m is {entry.voxel_m:g}; expected {surface.voxel_m:g} as in "
+            f"{entry.file}",
+            hint="copy or build the map again",
+        )
+    return surface
 
 
 def map_info(path: Path) -> dict[str, Any]:

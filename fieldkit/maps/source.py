@@ -11,6 +11,8 @@ from fieldkit.frames import Pose
 from fieldkit.store import read_camera, read_rig, read_tum
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".bmp")
+# Images with a SLAM pose that fix scale and frame of a map.
+MIN_POSES = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +52,7 @@ class MapSource:
 def read_source(path: Path) -> MapSource:
     """Read a SOURCE folder: with rig.toml a rig's walk, else images/ and camera.toml.
 
-    Raises MapError when it is neither, or when images, camera or poses are missing.
+    Raises MapError when it is neither, or when images, camera or poses are missing, or the poses are of other images.
     """
     path = Path(path)
     if not path.is_dir():
@@ -66,7 +68,18 @@ def read_source(path: Path) -> MapSource:
             f"{path / 'images'}: no image found; expected files like {', '.join(IMAGE_SUFFIXES[:3])}",
             hint="put the mapping images there",
         )
+    posed = sum(image.slam_from_cam is not None for image in source.images)
+    if posed < MIN_POSES:
+        raise MapError(
+            f"{_poses_file(path)}: names {posed} of the {len(source.images)} images; expected at least {MIN_POSES}, "
+            "which give the map its scale and gravity",
+            hint="give each pose the name of its image file, without the folder",
+        )
     return source
+
+
+def _poses_file(path: Path) -> Path:
+    return path / ("slam_poses.txt" if (path / "rig.toml").is_file() else "poses.txt")
 
 
 def _image_files(folder: Path) -> list[Path]:
@@ -75,7 +88,7 @@ def _image_files(folder: Path) -> list[Path]:
 
 def _read_rig_folder(path: Path) -> MapSource:
     rig = read_rig(path / "rig.toml")
-    poses = _poses(path / "slam_poses.txt")
+    poses = _poses(_poses_file(path))
     images: list[SourceImage] = []
     frames: dict[str, list[tuple[int, Pose]]] = {}
     for camera in rig.cameras:
@@ -102,7 +115,7 @@ def _read_rig_folder(path: Path) -> MapSource:
 
 def _read_image_folder(path: Path) -> MapSource:
     camera = read_camera(path / "camera.toml")
-    poses = _poses(path / "poses.txt")
+    poses = _poses(_poses_file(path))
     images = []
     for file in _image_files(path / "images"):
         pose = poses.get(file.name, poses.get(file.stem))
