@@ -18,12 +18,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fieldkit import maps, store
-from fieldkit.errors import JudgeError
+from fieldkit.errors import FrameError, JudgeError
 from fieldkit.frames import Pose, Trajectory, log, pose_error
 from fieldkit.surface import read_ply
-from fieldkit.types import Run, SceneMap, Surface, TagMap
+from fieldkit.types import Run, SceneMap, Surface, TagMap, ViewResult
 
 Array = NDArray[np.float64]
+# world_from_cam by session, visit and view.
+Cameras = Mapping[tuple[str, str, str], Pose]
 LANDMARK_SAMPLE = 5000
 
 
@@ -40,16 +42,24 @@ class Gauge:
 def judge(session: Path, *, map_path: Path, tags_path: Path | None, run_path: Path | None = None) -> dict[str, Any]:
     """Compare map, tags and optionally a run with the truth; return the values of ``fieldkit judge --json``.
 
-    Errors are in m and deg; ``nees`` is the normalised estimation error squared (6 degrees of freedom). Raises
-    JudgeError when the session holds no truth or does not belong to the map.
+    Errors are in m and deg; ``nees`` is the normalised estimation error squared (6 degrees of freedom). An entry's
+    ``id`` is that of what it judges: a tag, a visit, a view. Without tags or run their parts are empty. Raises
+    JudgeError when the session holds no truth, or map, tags, run and session do not belong together.
     """
     truth = Path(session) / "truth"
     if not truth.is_dir():
         raise JudgeError(f"{session}: has no truth/ folder; expected a session from `sim-bridge synthesize`")
     scene_map = maps.load_map(map_path)
+    tags = None if tags_path is None else store.read_tags(tags_path)
+    run = None if run_path is None else store.read_run(run_path)
+    if tags is not None:
+        _refuse_other_map(f"{tags_path}: calibrated", tags.map_digest, scene_map, hint="calibrate the tags in this map")
+    if run is not None:
+        _refuse_other_map(f"{run_path}: replayed", run.map_digest, scene_map, hint="replay the session in this map")
     gauge = fit_gauge(scene_map, dict(store.read_tum(truth / "mapping_poses.txt")))
+    cameras = {} if run is None else _true_cameras(run, truth / "view_poses.txt")
     up = gauge.world_from_map.rotation.apply([0.0, 0.0, 1.0])
-    result: dict[str, Any] = {
+    return {
         "version": 1,
         "gauge": {"rms_m": gauge.rms_m, "max_m": gauge.max_m},
         "map": {
@@ -57,14 +67,20 @@ def judge(session: Path, *, map_path: Path, tags_path: Path | None, run_path: Pa
             "gravity_deg": float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0)))),
             "landmark_median_m": _landmark_median(scene_map, gauge, truth / "surface.ply"),
         },
-        "tags": [] if tags_path is None else _judge_tags(store.read_tags(tags_path), truth, gauge),
-        "priors": [],
-        "truths": [],
-        "estimates": {},
+        "tags": [] if tags is None else _judge_tags(tags, truth, gauge),
+        "priors": [] if run is None else _judge_priors(run, truth, gauge),
+        "truths": [] if run is None else _judge_truths(run, cameras, gauge),
+        "estimates": _judge_estimates(() if run is None else run.results, cameras, gauge),
     }
-    if run_path is not None:
-        result.update(_judge_run(store.read_run(run_path), truth, gauge))
-    return result
+
+
+def _refuse_other_map(what: str, digest: str, scene_map: SceneMap, *, hint: str) -> None:
+    """Raise JudgeError unless something was made with this map: its frame is this map's alone."""
+    if digest != scene_map.digest:
+        raise JudgeError(
+            f"{what} in the map {digest[:12]}; expected {scene_map.digest[:12]}, the digest of {scene_map.path}",
+            hint=hint,
+        )
 
 
 def fit_gauge(scene_map: SceneMap, true_cameras: Mapping[str, Pose]) -> Gauge:
@@ -140,47 +156,81 @@ def _judge_tags(tags: TagMap, truth: Path, gauge: Gauge) -> list[dict[str, Any]]
     return result
 
 
-def _judge_run(run: Run, truth: Path, gauge: Gauge) -> dict[str, Any]:
-    bodies = _trajectory(truth / "body_poses.txt")
-    cameras = dict(store.read_tum(truth / "view_poses.txt"))
-    times = {(r.session, r.visit, r.view): str(r.t_ns) for r in run.results}
-    priors = [
+def _judge_priors(run: Run, truth: Path, gauge: Gauge) -> list[dict[str, Any]]:
+    rows = sorted(_stamped(truth / "body_poses.txt").items(), key=lambda row: row[0])
+    times = np.array([t_ns for t_ns, _ in rows], dtype=np.int64)
+    bodies = Trajectory(times, tuple(p for _, p in rows), "world", "body", max_gap_ns=2_000_000_000)
+    result = []
+    for plan in run.plans:
+        prior = plan.prior
+        try:
+            true = bodies.at(prior.t_ns)
+        except FrameError as error:
+            raise JudgeError(
+                f"{truth / 'body_poses.txt'}: no pose at {prior.t_ns} ns, the prior of {prior.visit}: {error.message}",
+                hint="judge a run of this session",
+            ) from error
+        keys = {"session": plan.session, "id": prior.visit, "visit": prior.visit}
+        result.append(_entry(keys, gauge.world_from_map * prior.map_from_body, true, prior.covariance))
+    return result
+
+
+def _judge_truths(run: Run, cameras: Cameras, gauge: Gauge) -> list[dict[str, Any]]:
+    return [
         _entry(
-            {"session": p.session, "visit": p.prior.visit},
-            gauge.world_from_map * p.prior.map_from_body,
-            bodies.at(p.prior.t_ns),
-            p.prior.covariance,
-        )
-        for p in run.plans
-    ]
-    truths = [
-        _entry(
-            {"session": session, "visit": t.visit, "view": t.view},
+            {"session": session, "id": t.view, "visit": t.visit, "view": t.view},
             gauge.world_from_map * t.map_from_cam,
-            cameras[times[session, t.visit, t.view]],
+            cameras[session, t.visit, t.view],
             t.covariance,
         )
         for session, t in run.truths
-        if (session, t.visit, t.view) in times
+        if (session, t.visit, t.view) in cameras
     ]
-    return {"priors": priors, "truths": truths, "estimates": _judge_estimates(run, cameras, gauge)}
 
 
-def _judge_estimates(run: Run, cameras: Mapping[str, Pose], gauge: Gauge) -> dict[str, Any]:
+def _judge_estimates(results: Sequence[ViewResult], cameras: Cameras, gauge: Gauge) -> dict[str, Any]:
     entries = [
-        _entry({}, gauge.world_from_map * r.estimate.map_from_cam, cameras[str(r.t_ns)], r.estimate.covariance)
-        for r in run.results
+        _entry(
+            {}, gauge.world_from_map * r.estimate.map_from_cam, cameras[r.session, r.visit, r.view],
+            r.estimate.covariance,
+        )
+        for r in results
         if r.estimate.map_from_cam is not None and r.estimate.covariance is not None
-    ]
-    failed = sum(r.estimate.map_from_cam is None for r in run.results)
+    ]  # fmt: skip
+    failed = sum(r.estimate.map_from_cam is None for r in results)
     infinite = [float("inf")] * failed
     return {
-        "n": len(run.results),
+        "n": len(results),
         "failed": failed,
         "median_position_m": _median([e["position_m"] for e in entries] + infinite),
         "median_rotation_deg": _median([e["rotation_deg"] for e in entries] + infinite),
         "nees_trimmed": trimmed_mean([e["nees"] for e in entries]),
     }
+
+
+def _true_cameras(run: Run, path: Path) -> Cameras:
+    """Return world_from_cam of every view of a run; raises JudgeError where the session's truth has no such stamp."""
+    stamped = _stamped(path)
+    for r in run.results:
+        if r.t_ns not in stamped:
+            raise JudgeError(
+                f"{path}: has no pose at {r.t_ns} ns, the view {r.view} of {r.visit}; expected one for every image",
+                hint="judge a run of this session",
+            )
+    return {(r.session, r.visit, r.view): stamped[r.t_ns] for r in run.results}
+
+
+def _stamped(path: Path) -> dict[int, Pose]:
+    """Read poses by their stamps in ns."""
+    result = {}
+    for name, world_from_child in store.read_tum(path):
+        try:
+            result[int(np.int64(int(name)))] = world_from_child
+        except (ValueError, OverflowError) as error:
+            raise JudgeError(
+                f"{path}: the stamp {name!r} is no whole number; expected nanoseconds", hint="synthesize it again"
+            ) from error
+    return result
 
 
 def _median(values: Sequence[float]) -> float | None:
@@ -193,9 +243,3 @@ def trimmed_mean(values: Sequence[float], *, share: float = 0.02) -> float | Non
         return None
     ordered = np.sort(values)
     return float(np.mean(ordered[: max(len(ordered) - int(np.ceil(share * len(ordered))), 1)]))
-
-
-def _trajectory(path: Path) -> Trajectory:
-    rows = store.read_tum(path)
-    times = np.array([int(name) for name, _ in rows], dtype=np.int64)
-    return Trajectory(times, tuple(p for _, p in rows), "world", "body", max_gap_ns=2_000_000_000)
