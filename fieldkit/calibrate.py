@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -14,6 +16,8 @@ import numpy as np
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
+from fieldkit.frames import Array, Pose
+from fieldkit.frames import log as pose_log
 from fieldkit.localize import Localizer
 from fieldkit.maps import load_map
 from fieldkit.protocol import LocalizerRules
@@ -30,6 +34,12 @@ PHOTO_SCALES = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
 # Photos are localized at this multiple of the mapping images' focal length in pixels: the many keypoints of finer
 # texture, which mapping could not see, find no match and crowd out those that do
 FOCAL_RATIO = 1.5
+# Poses of one tag that differ by less than this, 1 sigma per axis, are not told apart; beyond this chi-square (6
+# degrees of freedom, one in a thousand) they are two places
+PLACE_SIGMA_M, PLACE_SIGMA_RAD = 0.003, math.radians(0.2)
+PLACE_GATE = 22.5
+# Noise of fewer photos than show their own scale; and so many photos make one that contradicts them an outlier
+FEW_PHOTOS, FEW_SCALE, OUTVOTING_PHOTOS = 4, 2.0, 3
 # A tag known worse than this, 1 sigma per axis, deserves a warning
 WARN_SIGMA_M, WARN_SIGMA_RAD = 0.01, math.radians(0.5)
 
@@ -95,8 +105,10 @@ def calibrate_photos(
     which all photos share, and an error of the tag's size are not in it.
 
     The folder holds photos.toml, or photos of one camera (``camera``, else camera.toml in the folder). ``sizes_m`` as
-    `parse_sizes` returns it. A tag whose photos all name a visit gets one pose per visit; one that is also in photos
-    without a visit is fixed, and all its photos count. Raises TagError, StoreError or LocalizeError.
+    `parse_sizes` returns it. A tag whose photos all name a visit gets one pose per visit. One that is also in photos
+    without a visit is fixed where the poses from these photos and from every visit's agree: one pose for every visit,
+    from all its photos. Where they do not, the tag moved: it keeps one pose per visit, and its photos without a visit
+    are rejected. Raises TagError, StoreError or LocalizeError.
     """
     listed = _list_photos(Path(photos), camera)
     shots, rejected = _find_tags(Path(photos), listed, sizes_m, families, progress)
@@ -104,9 +116,10 @@ def calibrate_photos(
     rejected += failed
     verdicts: list[TagPhoto] = []
     tags: list[TagPose] = []
-    for (tag_id, family, visit), group in sorted(_groups(located).items(), key=lambda g: (g[0][0], str(g[0][1:]))):
-        size_m = sizes_m[tag_id] if tag_id in sizes_m else sizes_m[None]
-        fix = fuse_sightings([s.sighting for s in group], size_m, scales=PHOTO_SCALES)
+    groups, homeless = _groups(located, sizes_m)
+    rejected += homeless
+    for (tag_id, family, visit), group in sorted(groups.items(), key=lambda g: (g[0][0], str(g[0][1:]))):
+        size_m, fix = _size(tag_id, sizes_m), _fuse(group, sizes_m)
         tags.append(_tag_pose(fix, tag_id, family, size_m, visit))
         verdicts += [_photo_verdict(s, fix, index, visit) for index, s in enumerate(group)]
     if not tags:
@@ -150,6 +163,7 @@ def _list_photos(folder: Path, camera: Path | None) -> list[_Photo]:
         raise TagError(f"{folder}: no such folder; expected a folder with photos of tags")
     if (folder / "photos.toml").is_file():
         entries = read_photos(folder / "photos.toml")
+        _check_inside(folder, [e.file for e in entries] + ([] if camera else [e.camera for e in entries]))
         paths = {e.camera: camera or folder / e.camera for e in entries}
         cameras = {name: read_camera(path) for name, path in paths.items()}
         listed = [_Photo(e.file, folder / e.file, cameras[e.camera], paths[e.camera], e.visit) for e in entries]
@@ -168,7 +182,31 @@ def _list_photos(folder: Path, camera: Path | None) -> list[_Photo]:
     for photo in listed:
         if not photo.path.is_file():
             raise TagError(f"{photo.path}: no such photo; expected it, since photos.toml lists it")
+    _check_once(folder, listed)
     return listed
+
+
+def _check_inside(folder: Path, names: Sequence[str]) -> None:
+    # By the text of the path: a link that somebody put into the folder is in the folder
+    for name in names:
+        normal = os.path.normpath(name)
+        if os.path.isabs(normal) or normal.split(os.sep)[0] == os.pardir:
+            raise TagError(
+                f"{folder / 'photos.toml'}: {name!r} leads outside of the folder; expected a path in {folder}",
+                hint="copy the file into the folder, or give the camera with --camera",
+            )
+
+
+def _check_once(folder: Path, listed: Sequence[_Photo]) -> None:
+    first: dict[Path, str] = {}
+    for photo in listed:
+        path = photo.path.resolve()
+        if path in first:
+            raise TagError(
+                f"{folder}: photo {photo.file} is listed twice, first as {first[path]}; expected every photo once",
+                hint="remove one of the two",
+            )
+        first[path] = photo.file
 
 
 def _read_photo(photo: _Photo) -> Image | None:
@@ -282,13 +320,69 @@ def _reduced(image: Image, camera: Camera, focal_px: float) -> tuple[Image, Came
     return np.asarray(resized, dtype=np.uint8), small
 
 
-def _groups(located: Sequence[_Located]) -> dict[tuple[int, str, str | None], list[_Located]]:
-    fixed = {s.sighting.detection.id for s in located if s.photo.visit is None}
-    groups: dict[tuple[int, str, str | None], list[_Located]] = {}
+def _size(tag_id: int, sizes_m: Mapping[int | None, float]) -> float:
+    return sizes_m[tag_id] if tag_id in sizes_m else sizes_m[None]
+
+
+def _fuse(group: Sequence[_Located], sizes_m: Mapping[int | None, float]) -> TagFix:
+    sightings = [s.sighting for s in group]
+    return fuse_sightings(sightings, _size(sightings[0].detection.id, sizes_m), scales=PHOTO_SCALES)
+
+
+def _groups(
+    located: Sequence[_Located], sizes_m: Mapping[int | None, float]
+) -> tuple[dict[tuple[int, str, str | None], list[_Located]], list[TagPhoto]]:
+    """Return the photos that share one pose, by tag id, family and visit (None: every visit), and those rejected."""
+    by_tag: dict[tuple[int, str], list[_Located]] = {}
     for s in located:
-        d = s.sighting.detection
-        groups.setdefault((d.id, d.family, None if d.id in fixed else s.photo.visit), []).append(s)
-    return groups
+        by_tag.setdefault((s.sighting.detection.id, s.sighting.detection.family), []).append(s)
+    groups: dict[tuple[int, str, str | None], list[_Located]] = {}
+    rejected: list[TagPhoto] = []
+    for (tag_id, family), every in by_tag.items():
+        by_visit: dict[str | None, list[_Located]] = {}
+        for s in every:
+            by_visit.setdefault(s.photo.visit, []).append(s)
+        if None in by_visit and len(by_visit) > 1:
+            moved = _contradiction({visit: _fuse(group, sizes_m) for visit, group in by_visit.items()})
+            if moved is None:
+                by_visit = {None: every}
+            else:
+                reason = f"the tag has another place in {moved}; expected the visit of this photo in photos.toml"
+                rejected += [TagPhoto(s.photo.file, tag_id, used=False, reason=reason) for s in by_visit.pop(None)]
+        groups |= {(tag_id, family, visit): group for visit, group in by_visit.items()}
+    return groups, rejected
+
+
+def _contradiction(fixes: Mapping[str | None, TagFix]) -> str | None:
+    """Name two groups of photos between which a tag moved, or None where all agree on one place.
+
+    A visit's only photo does not contradict photos without a visit that outvote it: it is an outlier among them.
+    """
+    outvoting = sum(fixes[None].used) >= OUTVOTING_PHOTOS
+    counted = {v: f for v, f in fixes.items() if v is None or not (outvoting and len(f.used) == 1)}
+    for (one, a), (two, b) in itertools.combinations(counted.items(), 2):
+        if _places_differ(a, b):
+            named = [f"visit {v}" if v is not None else "photos without a visit" for v in (one, two)]
+            return " than in ".join(named)
+    return None
+
+
+def _places_differ(one: TagFix, two: TagFix) -> bool:
+    floor = np.diag([PLACE_SIGMA_RAD**2] * 3 + [PLACE_SIGMA_M**2] * 3)
+    for (a, a_covariance), (b, b_covariance) in itertools.product(_places(one), _places(two)):
+        delta = pose_log(a.inv() * b)
+        if float(delta @ np.linalg.solve(a_covariance + b_covariance + floor, delta)) <= PLACE_GATE:
+            return False
+    return True
+
+
+def _places(fix: TagFix) -> list[tuple[Pose, Array]]:
+    """Return the pose with its covariance, and the other planar solution where the photos leave it open."""
+    factor = FEW_SCALE**2 if sum(fix.used) < FEW_PHOTOS else 1.0
+    places = [(fix.ref_from_tag, fix.covariance * factor)]
+    if not fix.is_certain and fix.alternative is not None and fix.alternative_covariance is not None:
+        places.append((fix.alternative, fix.alternative_covariance * factor))
+    return places
 
 
 def _tag_pose(fix: TagFix, tag_id: int, family: str, size_m: float, visit: str | None) -> TagPose:

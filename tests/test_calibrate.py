@@ -184,6 +184,67 @@ def test_a_tag_that_is_also_in_photos_without_a_visit_is_fixed(wall_photos: Wall
     assert [(t.id, t.visit, t.n_photos) for t in tags.tags] == [(1, None, 3), (2, None, 3)]
 
 
+def test_a_tag_that_moves_between_visits_keeps_its_places_though_a_photo_without_visit_shows_it(
+    wall_photos: Wall, tmp_path: Path
+) -> None:
+    entries = [("a0.png", None), ("a1.png", "w01"), ("a2.png", "w01"), ("moved.png", "w02")]
+    folder = listed(wall_photos, tmp_path / "p", entries)
+    tags = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M})
+    assert [(t.id, t.visit, t.n_photos) for t in tags.tags] == [(1, "w01", 2), (1, "w02", 1)]
+    second = tags.find(1, visit="w02")
+    assert second is not None
+    assert pose_error(second.map_from_tag, true_pose(1))[0] == pytest.approx(0.15, abs=0.01)
+    (rejected,) = (p for p in tags.photos if p.tag_id == 1 and not p.used)
+    assert (rejected.file, rejected.visit) == ("a0.png", None)
+    assert rejected.reason.startswith("the tag has another place in photos without a visit than in visit w02; expected")
+    assert tags.find(1, visit="w03") is None
+
+
+def test_a_visit_that_contradicts_the_photos_without_a_visit_keeps_its_own_place(
+    wall_photos: Wall, tmp_path: Path
+) -> None:
+    folder = listed(wall_photos, tmp_path / "p", [("moved.png", None), ("a0.png", "w01"), ("a1.png", "w01")])
+    tags = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M})
+    assert [(t.visit, t.n_photos) for t in tags.tags] == [("w01", 2)]
+    assert pose_error(tags.tags[0].map_from_tag, true_pose(1))[0] < 0.01
+    folder = listed(wall_photos, tmp_path / "q", [("a2.png", None), ("a0.png", "w01"), ("a1.png", "w01")])
+    tags = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M})
+    assert [(t.visit, t.n_photos) for t in tags.tags] == [(None, 3)]
+
+
+def test_one_photo_of_a_visit_does_not_outvote_the_photos_of_a_fixed_tag(wall_photos: Wall, tmp_path: Path) -> None:
+    entries = [*((f"a{i}.png", None) for i in range(3)), ("moved.png", "w02"), ("a3.png", "w01")]
+    tags = calibrate_photos(listed(wall_photos, tmp_path / "p", entries), wall_photos.scene_map, sizes_m={1: SIZE_M})
+    assert [(t.id, t.visit, t.n_photos) for t in tags.tags] == [(1, None, 4)]
+    assert [p.file for p in tags.photos if p.tag_id == 1 and not p.used] == ["moved.png"]
+
+
+@pytest.mark.parametrize("again", ["a0.png", "./a0.png", "link.png"])
+def test_a_photo_that_is_listed_twice_is_refused(wall_photos: Wall, tmp_path: Path, again: str) -> None:
+    folder = listed(wall_photos, tmp_path / "p", [("a0.png", None)])
+    (folder / "link.png").symlink_to(folder / "a0.png")
+    write_photos(folder / "photos.toml", [PhotoEntry(f, "camera.toml", None) for f in ("a0.png", again)])
+    message = rf"p: photo {again} is listed twice, first as a0\.png; expected every photo once; remove one"
+    with pytest.raises(TagError, match=message):
+        calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M})
+
+
+@pytest.mark.parametrize("upwards", ["../", "x/../../", "/"])
+@pytest.mark.parametrize("what", ["photo", "camera"])
+def test_a_path_that_leads_outside_of_the_folder_is_refused(
+    wall_photos: Wall, tmp_path: Path, upwards: str, what: str
+) -> None:
+    folder = listed(wall_photos, tmp_path / "p", [("a0.png", None)])
+    (tmp_path / "a1.png").symlink_to(wall_photos.folder / "a1.png")
+    (tmp_path / "camera.toml").symlink_to(wall_photos.folder / "camera.toml")
+    (folder / "x").mkdir()
+    way = f"{tmp_path}/" if upwards == "/" else upwards
+    entry = PhotoEntry(way + "a1.png", "camera.toml") if what == "photo" else PhotoEntry("a0.png", way + "camera.toml")
+    write_photos(folder / "photos.toml", [entry])
+    with pytest.raises(TagError, match=r"photos\.toml: '.*' leads outside of the folder; expected a path in .*p; "):
+        calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M})
+
+
 def test_two_photos_that_disagree_fail_the_tag(wall_photos: Wall, tmp_path: Path) -> None:
     folder = listed(wall_photos, tmp_path / "p", [("a0.png", None), ("moved.png", None)])
     (tag,) = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M}).tags
