@@ -116,7 +116,7 @@ def tags_calibrate(
     from fieldkit import store
     from fieldkit.calibrate import calibrate_tags, parse_sizes
 
-    store.refuse_existing(out, force=force)
+    store.refuse_existing(out, force=force, kind="file")
     with _progress() as progress:
         tags = calibrate_tags(photos, map, camera=camera, sizes_m=parse_sizes(size_m), progress=progress)
     store.write_tags(out, tags)
@@ -171,7 +171,7 @@ def localize(
     from fieldkit.localize import Localizer
     from fieldkit.localize.files import localize_files
 
-    store.refuse_existing(out, force=force)
+    store.refuse_existing(out, force=force, kind="file")
     calibration = store.read_camera(camera)
     localizer = Localizer(maps.load_map(map))
     with _progress() as progress:
@@ -273,7 +273,7 @@ def judge(
         return
     console = Console()
     for title in ("gauge", "map", "estimates"):
-        if found[title]:
+        if found[title].get("n", 1):
             _print_mapping(found[title], title=title)
     for title, keys in (("tags", ("id", "visit")), ("priors", ("visit",))):
         if found[title]:

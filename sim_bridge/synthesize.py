@@ -62,12 +62,10 @@ def synthesize(
             raise SynthesisError(f"unknown format {wanted!r}", hint=suggestion(wanted, list(recorder.RECORDINGS)))
     if seed < 0:
         raise SynthesisError(f"seed {seed}; expected 0 or more", hint="choose another seed")
-    refuse_existing(out, force=force)
-    if out.exists() and not (out / "session.toml").exists() and any(out.iterdir() if out.is_dir() else [out]):
-        raise SynthesisError(f"{out}: not a session, so --force does not replace it", hint="choose another --out")
+    refuse_existing(out, force=force, marker="session.toml", kind="folder")
     room = SCENES[scene](seed)
     stage = staging.set_stage(room, chosen.stage, rng=generator(seed, 4))
-    with atomic_folder(out, force=force) as folder:
+    with atomic_folder(out, force=force, marker="session.toml") as folder:
         _write_mapping(folder, room, chosen.walk, seed=seed)
         _write_photos(folder, stage, chosen.photos, seed=seed)
         _write_robot(folder, stage, chosen, formats, seed=seed)

@@ -17,7 +17,7 @@ import pytest
 from synthetic_run import make_run
 
 from fieldkit import report, store
-from fieldkit.errors import ReportError
+from fieldkit.errors import ReportError, StoreError
 from fieldkit.report import render, thumbnail_key, write_report
 from fieldkit.scores import summarize_run, table
 from fieldkit.types import Excluded, PlanView, Run
@@ -189,7 +189,7 @@ def test_run_without_pictures_and_landmarks_is_drawn(run: Run) -> None:
 def test_existing_file_is_kept_unless_forced(run: Run, page: str, tmp_path: Path) -> None:
     out = tmp_path / "report.html"
     out.write_text("old")
-    with pytest.raises(ReportError, match=r"report\.html: exists already; nothing was written; .*--force"):
+    with pytest.raises(StoreError, match=r"report\.html: exists already; give --force"):
         write_report([run], out)
     assert out.read_text() == "old"
     write_report([run], out, force=True)
@@ -210,7 +210,7 @@ def test_report_that_fails_half_way_leaves_the_old_file(run: Run, tmp_path: Path
 def test_no_run_and_a_folder_as_output_are_errors(run: Run, tmp_path: Path) -> None:
     with pytest.raises(ReportError, match="no run to report; expected at least one run folder"):
         write_report([], tmp_path / "report.html")
-    with pytest.raises(ReportError, match="is a folder; expected the name of an HTML file"):
+    with pytest.raises(StoreError, match="is a folder; expected a file"):
         write_report([run], tmp_path)
 
 

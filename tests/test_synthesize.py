@@ -284,7 +284,7 @@ def test_an_existing_session_is_kept(session: Path) -> None:
 
 def test_force_does_not_replace_a_folder_that_is_no_session(tmp_path: Path) -> None:
     (tmp_path / "letters.txt").write_text("dear")
-    with pytest.raises(SynthesisError, match="not a session"):
+    with pytest.raises(StoreError, match=r"holds no session\.toml, so --force does not replace it"):
         synthesize.synthesize("room", tmp_path, seed=SEED, options=TINY, force=True)
 
 

@@ -9,6 +9,7 @@ the reference topic, which yields the start pose and the truth. The body is a fr
 
 from __future__ import annotations
 
+import itertools
 import re
 import shutil
 from pathlib import Path
@@ -52,7 +53,7 @@ def drifting(poses: list[Pose], *, rng: np.random.Generator) -> list[Pose]:
     """Return the poses as odometry with 3 % error of distance and 2 deg of yaw per metre would report them."""
     scale, yaw_per_m = 1.0 + 0.03 * rng.choice([-1, 1]), np.radians(2.0) * rng.choice([-1, 1])
     result = [Pose.identity()]
-    for before, after in zip(poses[:-1], poses[1:], strict=True):
+    for before, after in itertools.pairwise(poses):
         step = before.inv() * after
         travelled = float(np.linalg.norm(step.translation))
         noisy = Pose.from_components(step.translation * scale, step.rotation)

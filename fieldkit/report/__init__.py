@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from fieldkit import __version__
 from fieldkit.errors import ReportError
 from fieldkit.report.page import chapter, thumbnail_key
-from fieldkit.store import atomic_write
+from fieldkit.store import atomic_write, refuse_existing
 from fieldkit.types import Run
 
 __all__ = ["render", "thumbnail_key", "write_report"]
@@ -19,14 +19,10 @@ __all__ = ["render", "thumbnail_key", "write_report"]
 def write_report(runs: Sequence[Run], out: Path, *, force: bool = False) -> None:
     """Write the report of runs to an HTML file; each run is a chapter, runs are never pooled.
 
-    Raises ReportError when there is no run, or when ``out`` exists and ``force`` is not set. The page is made
-    before the file is touched: a failure leaves the old file.
+    Raises ReportError when there is no run, StoreError when ``out`` is a folder, or exists and ``force`` is not set.
+    The page is made before the file is touched: a failure leaves the old file.
     """
-    out = Path(out)
-    if out.is_dir():
-        raise ReportError(f"{out}: is a folder; expected the name of an HTML file", hint=f"try {out / 'report.html'}")
-    if out.exists() and not force:
-        raise ReportError(f"{out}: exists already; nothing was written", hint="choose another --out or pass --force")
+    refuse_existing(out, force=force, kind="file")
     atomic_write(out, render(runs))
 
 
