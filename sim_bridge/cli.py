@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -24,6 +25,7 @@ def synthesize(
     seed: int = 0,
     format: tuple[BagFormat, ...] = ("mcap",),
     waypoints: int = 4,
+    starts: Literal["each", "once"] = "each",
     stations: int = 54,
     quality: int = 90,
     force: bool = False,
@@ -36,6 +38,7 @@ def synthesize(
         seed: the same seed gives the same bytes
         format: one or more formats of the recording; all hold the same images
         waypoints: number of waypoints, each with a tripod tag
+        starts: each waypoint reached from the start tag, as in the paper, or once for the whole session
         stations: number of places at which the mapping rig takes its images
         quality: JPEG quality of the arm camera's images, 1 to 100
         force: replace an existing folder
@@ -53,6 +56,7 @@ def synthesize(
         standard,
         walk=dataclasses.replace(standard.walk, stations=stations),
         stage=dataclasses.replace(standard.stage, waypoints=waypoints),
+        schedule=dataclasses.replace(standard.schedule, starts=starts),
         recorder=dataclasses.replace(standard.recorder, jpeg_quality=quality),
     )
     begin = time.monotonic()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,13 @@ LOOKAHEAD_M = 1.5
 
 @dataclasses.dataclass(frozen=True)
 class ScheduleOptions:
-    """What is looked at, and how fast things move."""
+    """What is looked at, and how fast things move.
 
+    ``starts`` "each": every waypoint is reached from the start tag, as in the paper; "once": the robot sees the start
+    tag at the beginning and then goes from waypoint to waypoint.
+    """
+
+    starts: Literal["each", "once"] = "each"
     start_images: int = 8
     sweep_yaws: int = 8
     sweep_pitches_deg: tuple[float, ...] = (-6.0, 20.0)
@@ -69,14 +74,17 @@ class Schedule:
 def plan_session(
     stage: Stage, options: ScheduleOptions, *, stage_options: StageOptions, rng: np.random.Generator
 ) -> Schedule:
-    """Plan a session: for each waypoint from the start tag and back, as in the paper."""
+    """Plan a session: for each waypoint from the start tag and back, or one start and then all waypoints in turn."""
     planner = _Planner(stage, options, stage_options.drive_radius_m, rng)
     planner.wait(1.0)
-    for index in range(len(stage.waypoints)):
-        planner.look_at_start_tag(index)
+    for index, waypoint in enumerate(stage.waypoints):
+        if options.starts == "each":
+            planner.look_at_start_tag(waypoint.id)
+        elif index == 0:
+            planner.look_at_start_tag(None)
         planner.drive_to(index)
         planner.look_around(index)
-        planner.drive_back(index)
+        planner.leave(index)
     planner.wait(0.5)
     sway = np.stack(
         [
@@ -114,14 +122,15 @@ class _Planner:
         self.wait(0.0)
         return Schedule(self._body.build(), self._arm.build(), tuple(self._shots), tuple(self._events), self._now, sway)
 
-    def look_at_start_tag(self, index: int) -> None:
-        """Stand before the start tag while the arm moves slowly around the direction to it."""
-        visit, tag, count = self._stage.waypoints[index].id, self._stage.start_tag, self._options.start_images
+    def look_at_start_tag(self, visit: str | None) -> None:
+        """Stand before the start tag while the arm moves slowly around the direction to it; for one visit or all."""
+        tag, count = self._stage.start_tag, self._options.start_images
+        named = {} if visit is None else {"visit": visit}
         centre = looking_at(self._stage.world_from_start, tag.world_from_tag.translation).as_array()
         swing = np.radians([6.0, 0.0, 0.0, 3.0]) * self._rng.uniform(0.7, 1.0) * self._rng.choice([-1.0, 1.0])
         self._reach(centre - swing)
         self.wait(self._options.settle_s)
-        self._event("start_begin", tag_id=tag.id, visit=visit)
+        self._event("start_begin", tag_id=tag.id, **named)
         self.wait(0.1)
         begin, seconds = self._now, 0.3 * count
         self._arm.move(centre + swing, seconds=seconds)
@@ -129,19 +138,20 @@ class _Planner:
         for k in range(count):
             self._shots.append(Shot(begin + seconds * (k + self._rng.uniform(0.2, 0.8)) / count))
         self.wait(0.1)
-        self._event("start_end", tag_id=tag.id, visit=visit)
+        self._event("start_end", tag_id=tag.id, **named)
         self._reach(robot.STOWED.as_array())
         self.wait(0.2)
 
     def drive_to(self, index: int) -> None:
-        """Drive from the start to a waypoint, the arm stowed."""
-        waypoint = self._stage.waypoints[index]
-        self._drive(_flat(self._stage.world_from_start), _flat(waypoint.world_from_body))
+        """Drive from the start, or from the waypoint before, to a waypoint, the arm stowed."""
+        once = self._options.starts == "once" and index > 0
+        origin = self._stage.waypoints[index - 1].world_from_body if once else self._stage.world_from_start
+        self._drive(_flat(origin), _flat(self._stage.waypoints[index].world_from_body))
 
-    def drive_back(self, index: int) -> None:
-        """Stow the arm and drive back to the start; after the last waypoint the robot stays."""
+    def leave(self, index: int) -> None:
+        """Stow the arm and drive back to the start where the next visit begins there."""
         self._reach(robot.STOWED.as_array())
-        if index + 1 < len(self._stage.waypoints):
+        if index + 1 < len(self._stage.waypoints) and self._options.starts == "each":
             waypoint = self._stage.waypoints[index]
             self._drive(_flat(waypoint.world_from_body), _flat(self._stage.world_from_start))
 

@@ -251,6 +251,20 @@ def test_the_robot_never_drives_into_anything(stage: staging.Stage) -> None:
     assert stage.scene.free_floor(plan.body.values[:, :2], TINY.stage.drive_radius_m - 0.02).all()
 
 
+def test_one_start_serves_a_whole_session_in_the_other_mode(stage: staging.Stage) -> None:
+    options = dataclasses.replace(TINY.schedule, starts="once")
+    plan = schedule.plan_session(stage, options, stage_options=TINY.stage, rng=generator(SEED, 7))
+    starts = [e for _, e in plan.events if e["event"] == "start_begin"]
+    assert [("visit" in e, e["tag_id"]) for e in starts] == [(False, stage.start_tag.id)]
+    begins = [(t, e["visit"]) for t, e in plan.events if e["event"] == "visit_begin"]
+    assert [visit for _, visit in begins] == [w.id for w in stage.waypoints]
+    for (t_s, _), waypoint in zip(begins, stage.waypoints, strict=True):
+        position, rotation = pose_error(plan.world_from_body(t_s), waypoint.world_from_body)
+        assert position < 1e-6
+        assert rotation < 1e-6
+    assert stage.scene.free_floor(plan.body.values[:, :2], TINY.stage.drive_radius_m - 0.02).all()
+
+
 def digests(folder: Path) -> dict[str, str]:
     files = sorted(p for p in folder.rglob("*") if p.is_file())
     return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
