@@ -12,11 +12,11 @@ from typing import Any, Literal
 import tyro
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from tyro.conf import Positional
 from tyro.conf import UseAppendAction as Repeated
 
+from fieldkit.console import ProgressBars, cells, log_console, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
@@ -33,7 +33,7 @@ def inspect(recording: Positional[Path], *, layout: str | None = None, json: boo
     from fieldkit.bags import inspect_recording
 
     found = inspect_recording(recording, layout=layout)
-    _print_json(found) if json else _print_mapping(found, title=str(recording))
+    print_json(found) if json else print_mapping(found, title=str(recording))
 
 
 def map_build(
@@ -58,11 +58,11 @@ def map_build(
     from fieldkit import maps
 
     options = maps.MapOptions(scale=scale, voxel_m=voxel_m)
-    with _progress() as progress:
+    with ProgressBars() as progress:
         built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
     for warning in built.warnings:
         logging.getLogger(__name__).warning("%s: %s", source, warning)
-    _print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")
+    print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")
 
 
 def map_info(path: Positional[Path], *, json: bool = False) -> None:
@@ -75,7 +75,7 @@ def map_info(path: Positional[Path], *, json: bool = False) -> None:
     from fieldkit import maps
 
     found = maps.map_info(path)
-    _print_json(found) if json else _print_mapping(found, title=str(path))
+    print_json(found) if json else print_mapping(found, title=str(path))
 
 
 def map_compact(path: Positional[Path], *, out: Path, force: bool = False) -> None:
@@ -89,7 +89,7 @@ def map_compact(path: Positional[Path], *, out: Path, force: bool = False) -> No
     from fieldkit import maps
 
     maps.compact_map(path, out, force=force)
-    _print_mapping(maps.map_info(out), title=str(out))
+    print_mapping(maps.map_info(out), title=str(out))
 
 
 def tags_calibrate(
@@ -117,17 +117,17 @@ def tags_calibrate(
     from fieldkit.calibrate import calibrate_tags, parse_sizes
 
     store.refuse_existing(out, force=force, kind="file")
-    with _progress() as progress:
+    with ProgressBars() as progress:
         tags = calibrate_tags(photos, map, camera=camera, sizes_m=parse_sizes(size_m), progress=progress)
     store.write_tags(out, tags)
     if json:
-        _print_json(_tags_json(tags))
+        print_json(_tags_json(tags))
         return
-    table = _table("tag", "visit", "photos", "rms px", "sigma mm", "sigma deg", "verdict")
+    table = make_table("tag", "visit", "photos", "rms px", "sigma mm", "sigma deg", "verdict")
     for t in tags.tags:
         position, rotation = _sigmas(t.covariance)
-        cells = [t.id, t.visit or "-", t.n_photos, f"{t.rms_px:.2f}", f"{1e3 * position:.2f}", f"{rotation:.3f}"]
-        table.add_row(*map_str([*cells, t.verdict]))
+        row = [t.id, t.visit or "-", t.n_photos, f"{t.rms_px:.2f}", f"{1e3 * position:.2f}", f"{rotation:.3f}"]
+        table.add_row(*cells([*row, t.verdict]))
     Console().print(table)
     for photo in tags.photos:
         if not photo.used:
@@ -174,18 +174,18 @@ def localize(
     store.refuse_existing(out, force=force, kind="file")
     calibration = store.read_camera(camera)
     localizer = Localizer(maps.load_map(map))
-    with _progress() as progress:
+    with ProgressBars() as progress:
         found = localize_files(localizer, images, calibration, progress=progress)
     store.write_tum(out, [(n.replace(" ", "_"), e.map_from_cam) for n, e in found if e.map_from_cam is not None])
     failed = [f"{n} ({e.status})" for n, e in found if e.map_from_cam is None]
     if failed:
         logging.getLogger(__name__).warning("%d of %d images failed: %s", len(failed), len(found), ", ".join(failed))
     if json:
-        _print_json({"version": 1, "images": [{"name": n, **_estimate_json(e)} for n, e in found]})
+        print_json({"version": 1, "images": [{"name": n, **_estimate_json(e)} for n, e in found]})
         return
-    table = _table("image", "status", "matches", "inliers", "seconds")
+    table = make_table("image", "status", "matches", "inliers", "seconds")
     for name, e in found:
-        table.add_row(*map_str([name, e.status, e.n_matches, e.n_inliers, f"{sum(e.seconds.values()):.2f}"]))
+        table.add_row(*cells([name, e.status, e.n_matches, e.n_inliers, f"{sum(e.seconds.values()):.2f}"]))
     Console().print(table)
 
 
@@ -212,7 +212,7 @@ def replay(
     from fieldkit.replay import replay as replay_recordings
 
     rules = protocols.load(protocol)
-    with _progress() as progress:
+    with ProgressBars() as progress:
         run = replay_recordings(
             recordings, map_path=map, tags_path=tags, protocol=rules, out=out, force=force, progress=progress
         )
@@ -232,7 +232,7 @@ def score(run: Positional[Path], *, preset: str | None = None, json: bool = Fals
 
     loaded = store.read_run(run)
     if json:
-        _print_json(scores.score_dict(loaded, thresholds=None if preset is None else scores.preset(preset)))
+        print_json(scores.score_dict(loaded, thresholds=None if preset is None else scores.preset(preset)))
     else:
         _print_recall(loaded, preset=preset)
     return _missed_bounds(loaded)
@@ -269,18 +269,18 @@ def judge(
 
     found = judge_session(session, map_path=map, tags_path=tags, run_path=run)
     if json:
-        _print_json(found)
+        print_json(found)
         return
     console = Console()
     for title in ("gauge", "map", "estimates"):
         if found[title].get("n", 1):
-            _print_mapping(found[title], title=title)
+            print_mapping(found[title], title=title)
     for title, keys in (("tags", ("id", "visit")), ("priors", ("visit",))):
         if found[title]:
-            table = _table(*keys, "position m", "rotation deg", "nees", title=title)
+            table = make_table(*keys, "position m", "rotation deg", "nees", title=title)
             for entry in found[title]:
                 numbers = [f"{entry['position_m']:.4f}", f"{entry['rotation_deg']:.3f}", f"{entry['nees']:.1f}"]
-                table.add_row(*map_str([*(entry[k] or "-" for k in keys), *numbers]))
+                table.add_row(*cells([*(entry[k] or "-" for k in keys), *numbers]))
             console.print(table)
     if found["truths"]:
         console.print(_truth_table(found["truths"]))
@@ -288,11 +288,11 @@ def judge(
 
 def _truth_table(entries: Sequence[dict[str, Any]]) -> Table:
     """Return the errors of the truth, a row per visit; every view is in the JSON."""
-    table = _table("visit", "views", "largest position m", "largest rotation deg", title="truths")
+    table = make_table("visit", "views", "largest position m", "largest rotation deg", title="truths")
     for visit in dict.fromkeys(e["visit"] for e in entries):
         rows = [e for e in entries if e["visit"] == visit]
         position, rotation = (max(e[key] for e in rows) for key in ("position_m", "rotation_deg"))
-        table.add_row(*map_str([visit, len(rows), f"{position:.4f}", f"{rotation:.3f}"]))
+        table.add_row(*cells([visit, len(rows), f"{position:.4f}", f"{rotation:.3f}"]))
     return table
 
 
@@ -316,7 +316,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     logging.basicConfig(
         level=logging.INFO,
         format="%(message)s",
-        handlers=[RichHandler(console=_log_console(), show_time=False, show_path=False, markup=False)],
+        handlers=[RichHandler(console=log_console(), show_time=False, show_path=False, markup=False)],
     )
     try:
         sys.exit(_dispatch(words))
@@ -329,12 +329,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("fieldkit: interrupted", file=sys.stderr)
         sys.exit(130)
-
-
-def _log_console() -> Console:
-    """Return the console of log lines; away from a terminal every message stays on one line."""
-    console = Console(stderr=True)
-    return console if console.is_terminal else Console(stderr=True, width=100_000)
 
 
 def _dispatch(words: Sequence[str]) -> int:
@@ -350,31 +344,6 @@ def _dispatch(words: Sequence[str]) -> int:
             COMMANDS, prog="fieldkit", description=described, args=list(words), config=config
         )
     return int(result or 0)
-
-
-class _Bars:
-    """Progress bars on stderr, one per step; a step is called as (what, done, total)."""
-
-    def __init__(self) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._progress = Progress(*columns, console=Console(stderr=True))
-        self._steps: dict[str, Any] = {}
-
-    def __enter__(self) -> Callable[[str, int, int], None]:
-        self._progress.start()
-        return self._update
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def _update(self, what: str, done: int, total: int) -> None:
-        if what not in self._steps:
-            self._steps[what] = self._progress.add_task(what, total=total)
-        self._progress.update(self._steps[what], completed=done, total=total)
-
-
-def _progress() -> _Bars:
-    return _Bars()
 
 
 def _print_recall(run: Any, *, preset: str | None) -> None:
@@ -418,41 +387,6 @@ def _sigmas(covariance: Any) -> tuple[float, float]:
     import numpy as np
 
     return float(np.sqrt(np.trace(covariance[3:, 3:]))), float(np.degrees(np.sqrt(np.trace(covariance[:3, :3]))))
-
-
-def map_str(values: Sequence[object]) -> list[str]:
-    """Return the cells of a table row as text."""
-    return [str(v) for v in values]
-
-
-def _table(*header: str, title: str | None = None) -> Table:
-    return Table(*header, title=title, title_justify="left")
-
-
-def _print_json(values: Any) -> None:
-    from fieldkit.store import plain_json
-
-    print(plain_json(values), end="")
-
-
-def _print_mapping(values: dict[str, Any], *, title: str) -> None:
-    table = Table("", "", show_header=False, title=title, title_justify="left")
-    for key, value in _flat(values):
-        table.add_row(key, f"{value:.5g}" if isinstance(value, float) else str(value))
-    Console().print(table)
-
-
-def _flat(values: dict[str, Any], *, prefix: str = "") -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for key, value in values.items():
-        if isinstance(value, dict):
-            rows += _flat(value, prefix=f"{prefix}{key}.")
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
-            for index, item in enumerate(value):
-                rows += _flat(item, prefix=f"{prefix}{key}[{index}].")
-        else:
-            rows.append((prefix + key, value))
-    return rows
 
 
 if __name__ == "__main__":
