@@ -11,12 +11,11 @@ from typing import Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.table import Table
 from tyro.conf import Positional
 from tyro.conf import UseAppendAction as Repeated
 
-from fieldkit.console import ProgressBars, cells, log_console, make_table, print_json, print_mapping
+from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
@@ -235,6 +234,8 @@ def score(run: Positional[Path], *, preset: str | None = None, json: bool = Fals
         print_json(scores.score_dict(loaded, thresholds=None if preset is None else scores.preset(preset)))
     else:
         _print_recall(loaded, preset=preset)
+        for item in loaded.excluded:
+            logging.getLogger(__name__).warning("excluded %s: %s", item.what, item.reason)
     return _missed_bounds(loaded)
 
 
@@ -313,11 +314,7 @@ GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line: exit 0 done, 1 a user's mistake in one line, 2 usage, 3 a missed bound."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    logging.basicConfig(
-        level=logging.INFO,
-        format="%(message)s",
-        handlers=[RichHandler(console=log_console(), show_time=False, show_path=False, markup=False)],
-    )
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[log_handler()])
     try:
         sys.exit(_dispatch(words))
     except FieldkitError as error:
@@ -337,8 +334,9 @@ def _dispatch(words: Sequence[str]) -> int:
         group = GROUPS[words[0]]
         result = tyro.extras.subcommand_cli_from_dict(group, prog=f"fieldkit {words[0]}", args=words[1:], config=config)
     else:
-        described = "Which way should the robot look to know where it is, and how sure are we?\n\n" + "\n".join(
-            f"fieldkit {group} {' | '.join(commands)}" for group, commands in GROUPS.items()
+        groups = "; ".join(f"fieldkit {group} {', '.join(commands)}" for group, commands in GROUPS.items())
+        described = (
+            f"Which way should the robot look to know where it is, and how sure are we? More commands: {groups}."
         )
         result = tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="fieldkit", description=described, args=list(words), config=config
@@ -354,8 +352,6 @@ def _print_recall(run: Any, *, preset: str | None) -> None:
     for row in content.rows:
         table.add_row(*row)
     Console(width=max(140, Console().width)).print(table)
-    for item in run.excluded:
-        logging.getLogger(__name__).warning("excluded %s: %s", item.what, item.reason)
 
 
 def _missed_bounds(run: Any) -> int:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.logging import RichHandler
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -13,10 +15,14 @@ from rich.table import Table
 from fieldkit.store import plain_json
 
 
-def log_console() -> Console:
-    """Return the console of log lines; away from a terminal every message stays on one line."""
+def log_handler() -> logging.Handler:
+    """Return the handler of log lines; away from a terminal every message is one plain line."""
     console = Console(stderr=True)
-    return console if console.is_terminal else Console(stderr=True, width=100_000)
+    if console.is_terminal:
+        return RichHandler(console=console, show_time=False, show_path=False, markup=False)
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
+    return handler
 
 
 class ProgressBars:
@@ -28,13 +34,14 @@ class ProgressBars:
         self._steps: dict[str, Any] = {}
 
     def __enter__(self) -> Callable[[str, int, int], None]:
-        self._progress.start()
         return self._update
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
     def _update(self, what: str, done: int, total: int) -> None:
+        # Shown from the first step on: a mistake that is found before it stays one line.
+        self._progress.start()
         if what not in self._steps:
             self._steps[what] = self._progress.add_task(what, total=total)
         self._progress.update(self._steps[what], completed=done, total=total)

@@ -152,16 +152,17 @@ def _check_tags(recording: Recording, tags: TagMap) -> None:
         wanted += [(s.tag_id, visit.id, "start tag") for s in own if s.tag_id is not None]
         if recording.reference is None and visit.truth_tag_id is not None:
             wanted.append((visit.truth_tag_id, visit.id, "tripod tag"))
-    known = sorted({t.id for t in tags.tags})
+    known = ", ".join(f"{t.id} ({t.visit or 'every visit'})" for t in tags.tags)
     doubtful = set()
     for tag_id, visit_id, what in wanted:
         tag = tags.find(tag_id, visit=visit_id)
         if tag is None:
-            where = tags.path or "no tag file was given, and"
+            named = f"tag {tag_id}, the {what} of visit {visit_id} in {recording.path}"
+            if not tags.path:
+                raise ReplayError(f"no tag file was given; expected one with {named}", hint="give --tags")
             raise ReplayError(
-                f"{where} has no tag {tag_id}, the {what} of visit {visit_id} in {recording.path}; "
-                f"expected one of {known}",
-                hint="photograph and calibrate this tag, or correct the tag id of the recording",
+                f"{tags.path} has no {named}; expected it for this visit or every visit among {known}",
+                hint="photograph and calibrate this tag, or correct the ids of tag and visit",
             )
         if tag.verdict != "pass":
             doubtful.add(f"the {what} {tag_id} has the verdict {tag.verdict!r}")

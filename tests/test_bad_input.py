@@ -83,7 +83,7 @@ def test_a_tag_that_is_not_in_the_tag_file(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "tags.toml").write_text(TAGS.read_text().replace("id = 1\n", "id = 17\n"))
     line = replay(capsys, tmp_path, tags=tmp_path / "tags.toml")
     assert "tags.toml has no tag 1, the start tag" in line
-    assert "expected one of [2" in line
+    assert "among 17 (every visit), 2 (w01)" in line
 
 
 def test_tags_of_another_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

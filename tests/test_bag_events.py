@@ -169,3 +169,14 @@ def test_visits_that_share_the_ids_of_their_views_are_fine(tmp_path: Path) -> No
     second = (VISIT + VIEW).replace('"a"', '"b"')
     (tmp_path / "session.toml").write_text(SESSION + second)
     assert [[v.id for v in visit.views] for visit in open_recording(tmp_path).visits] == [["one"], ["one"]]
+
+
+def test_visits_of_a_session_file_take_the_views_announced_within_them(tmp_path: Path) -> None:
+    write_sample(tmp_path, "mcap")
+    (tmp_path / "session.toml").write_text(
+        'version = 1\nsession = "lab"\nrecording = "robot.mcap"\n'
+        f'[[visit]]\nid = "A"\nt_begin_ns = {stamp(10)}\nt_end_ns = {stamp(15)}\ntruth_tag_id = 2\n'
+    )
+    (visit,) = open_recording(tmp_path).visits
+    assert visit.id == "A"
+    assert [v.id for v in visit.views] == ["0", "1", "2"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -44,7 +45,7 @@ def make_run() -> Run:
     utilities = {("max", True): np.array([3.0, -np.inf]), ("random", None): np.array([0.0, -np.inf])}
     trial = Trial("s", "w01", "max", True, "a", 1.0, 3.0, "ok", (0.1, 0.2), (INF, INF), (0.01, 0.02), (0.3, 0.04))
     return Run(
-        protocol=protocol.load("paper_real"),
+        protocol=msgspec.structs.replace(protocol.load("paper_real"), policies=("max",)),
         map_digest="m",
         tags_digest="t",
         recordings=("robot.mcap",),
@@ -206,6 +207,7 @@ def test_a_folder_that_fails_half_way_leaves_the_old_one(tmp_path: Path) -> None
     [
         ("trials.csv", ("0.1", "none"), r"trials\.csv: line 2: could not convert"),
         ("trials.csv", ("utility", "use"), r"trials\.csv: lacks the columns utility"),
+        ("trials.csv", (",max,", ",fim,"), r"trials\.csv: has no row of max at s/w01; expected every policy"),
         ("estimates.csv", ("sweep", "swoop"), r"estimates\.csv: line 2: unknown kind of view 'swoop'"),
         ("run.json", ('"version": 1', '"version": 2'), r"run\.json: version 2; this fieldkit reads version 1"),
         ("run.json", ('"seed"', '"sed"'), r"run\.json: .*unknown field `sed`.*did you mean 'seed'"),

@@ -66,8 +66,10 @@ def find_marks(messages: Sequence[tuple[int, str]], session: SessionFile | None,
     """Read JSON events (time in the bag in ns, text); a table of session.toml replaces the events of its kind.
 
     An interval left open ends at the next begin, or at ``t_end_ns``. Events of unknown kind, and texts that are no
-    JSON object with an "event", are counted in the warnings. Raises BagError for a known event that lacks a key, a
-    visit that begins twice, a view of a visit that never begins, or a session.toml that contradicts itself.
+    JSON object with an "event", are counted in the warnings. Where session.toml lists visits but no views, its
+    visits take the views that the events announce within their intervals. Raises BagError for a known event that
+    lacks a key, a visit that begins twice, a view of a visit that never begins, or a session.toml that contradicts
+    itself.
     """
     told = _from_session(session, path) if session else Marks()
     replaced = {"start": bool(told.starts), "visit": bool(told.visits), "view": bool(told.views)}
@@ -77,14 +79,24 @@ def find_marks(messages: Sequence[tuple[int, str]], session: SessionFile | None,
         reader.take(t_ns, event)
     heard = reader.finish(t_end_ns)
     notes = [f"{n} events of unknown kind {kind!r} were ignored" for kind, n in sorted(ignored.items())]
+    views = _views_within(told.visits, heard.views) if told.visits else heard.views
     marks = Marks(
         told.starts or heard.starts,
         told.visits or heard.visits,
-        told.views or heard.views,
+        told.views or views,
         (*told.warnings, *notes, *heard.warnings),
     )
     _check_views(marks, path)
     return marks
+
+
+def _views_within(visits: Sequence[VisitMark], views: Sequence[ViewMark]) -> tuple[ViewMark, ...]:
+    return tuple(
+        dataclasses.replace(view, visit=visit.id)
+        for view in views
+        for visit in visits
+        if visit.t_begin_ns <= view.t_ns <= visit.t_end_ns
+    )
 
 
 def _from_session(session: SessionFile, path: Path) -> Marks:

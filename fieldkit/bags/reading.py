@@ -205,7 +205,7 @@ def _require_topics(bag: BagFile, layout: Layout) -> None:
         return sum(bag.topics[t].count for t in topics if t in bag.topics)
 
     where = f"; the bag has {topic_list(bag)}"
-    hint = "record the topic, or give the --layout that names it"
+    hint = "record the topic, or name the layout that has it in a session.toml"
     needed: dict[str, tuple[str, ...]] = {
         "image": (layout.compressed, layout.image),
         "camera_info": (layout.camera_info,),

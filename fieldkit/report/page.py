@@ -224,8 +224,8 @@ def _table_row(summary: Summary, best: tuple[float, ...]) -> TableRow:
     cells = tuple(
         Cell(
             recall=f"{100 * value:.1f}",
-            low=round(100 * low, 1),
-            high=round(100 * high, 1),
+            low=100 * low,
+            high=100 * high,
             value=round(100 * value, 1),
             best=summary.policy != BEST_POSSIBLE and value > 0 and value >= top - 1e-12,
         )

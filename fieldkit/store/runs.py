@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
 from urllib.parse import quote, unquote
@@ -106,6 +107,9 @@ def read_run(path: Path) -> Run:
     head = read_json(path / "run.json", _RunFile, what="run.json of a run folder")
     protocol = protocols.from_dict(head.protocol, source=f"{path / 'run.json'}: protocol")
     utilities, plan_view = _read_arrays(path)
+    trials = tuple(read_table(path / "trials.csv", TRIALS, _trial))
+    plans = _read_plans(path, utilities)
+    _check_complete(path, trials, plans, protocol)
     return Run(
         protocol=protocol,
         map_digest=head.map_digest,
@@ -114,15 +118,30 @@ def read_run(path: Path) -> Run:
         sessions=tuple(head.sessions),
         seed=head.seed,
         versions=head.versions,
-        trials=tuple(read_table(path / "trials.csv", TRIALS, _trial)),
+        trials=trials,
         results=tuple(read_table(path / "estimates.csv", ESTIMATES, _result)),
         truths=tuple(read_table(path / "truth.csv", TRUTHS, _truth)),
-        plans=_read_plans(path, utilities),
+        plans=plans,
         plan_view=plan_view,
         thumbnails={unquote(p.stem): p.read_bytes() for p in sorted((path / "thumbs").glob("*.jpg"))},
         excluded=tuple(head.excluded),
         path=str(path),
     )
+
+
+def _check_complete(
+    path: Path, trials: Sequence[Trial], plans: Sequence[VisitPlan], protocol: protocols.Protocol
+) -> None:
+    """Raise StoreError when trials.csv lacks a policy of the protocol at a visit: rows were lost."""
+    there = {(t.session, t.visit, t.policy) for t in trials}
+    for plan in plans:
+        for policy in protocol.policies:
+            if (plan.session, plan.prior.visit, policy) not in there:
+                raise StoreError(
+                    f"{path / 'trials.csv'}: has no row of {policy} at {plan.session}/{plan.prior.visit}; expected "
+                    "every policy at every visit",
+                    hint="replay the recording again",
+                )
 
 
 def _trial_cells(t: Trial) -> dict[str, object]:

@@ -40,6 +40,8 @@ def read_table(path: Path, columns: Sequence[str], parse: Callable[[Row], R]) ->
     result = []
     for row in reader:
         try:
+            if None in row.values():
+                raise ValueError("the line is cut off")
             result.append(parse(row))
         except (ValueError, TypeError, FieldkitError) as error:
             raise StoreError(f"{path}: line {reader.line_num}: {error}", hint="replay the recording again") from error
