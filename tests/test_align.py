@@ -1,0 +1,97 @@
+"""The metric frame of a map: similarity to SLAM positions, gravity, and what wrong positions cannot do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_map import looking
+
+from fieldkit.errors import MapError
+from fieldkit.frames import Pose, exp, pose_error
+from fieldkit.maps.align import align_to_slam, robust_similarity, umeyama
+
+ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7])
+
+
+def walk(rng: np.random.Generator, n: int = 60) -> list[Pose]:
+    """Camera poses along a loop of several metres, looking about."""
+    angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    return [
+        looking(np.array([3 * np.cos(a), 2 * np.sin(a), 1.6 + 0.1 * np.sin(5 * a)]), 2 * a, rng.normal(0, 0.2))
+        for a in angles
+    ]
+
+
+def as_sfm(poses: list[Pose], *, scale: float = 3.7) -> list[Pose]:
+    """Express poses in another frame and scale, as SfM would find them."""
+    return [
+        Pose.from_components(ROTATION.apply(scale * p.translation) + [5.0, -2.0, 9.0], ROTATION * p.rotation)
+        for p in poses
+    ]
+
+
+def test_umeyama_finds_the_similarity_exactly(rng: np.random.Generator) -> None:
+    source = rng.normal(size=(20, 3))
+    target = 0.3 * ROTATION.apply(source) + [1.0, 2.0, 3.0]
+    found = umeyama(source, target)
+    assert found.scale == pytest.approx(0.3, rel=1e-12)
+    np.testing.assert_allclose(found.points(source), target, atol=1e-12)
+
+
+def test_exact_slam_poses_give_back_every_camera(rng: np.random.Generator) -> None:
+    poses = walk(rng)
+    found = align_to_slam(as_sfm(poses), poses, seed=0)
+    assert found.map_from_sfm.scale == pytest.approx(1 / 3.7, rel=1e-9)
+    for sfm, slam in zip(as_sfm(poses), poses, strict=True):
+        assert max(pose_error(found.map_from_sfm.pose(sfm), slam)) < 1e-9
+    assert (found.n_used, found.n_total, found.verdict) == (60, 60, "pass")
+    assert found.rms_m < 1e-9
+    assert found.gravity_deg < 1e-6
+
+
+def test_a_third_of_wrong_slam_positions_does_not_move_the_map(rng: np.random.Generator) -> None:
+    poses = walk(rng)
+    noisy = [p * exp(rng.normal(0, [0.002, 0.002, 0.002, 0.01, 0.01, 0.01])) for p in poses]
+    wrong = list(noisy)
+    for i in rng.choice(60, 18, replace=False):
+        wrong[i] = Pose.from_translation(rng.normal(0, 1.0, 3)) * noisy[i]
+    clean, robust = (align_to_slam(as_sfm(poses), slam, seed=0) for slam in (noisy, wrong))
+    assert abs(robust.map_from_sfm.scale * 3.7 - 1) < 0.005
+    assert clean.gravity_deg < 0.3
+    assert robust.gravity_deg < 0.3
+    assert robust.n_used == pytest.approx(42, abs=2)
+
+
+def test_drift_widens_the_threshold_instead_of_losing_the_walk(rng: np.random.Generator) -> None:
+    poses = walk(rng)
+    drifting = [Pose.from_translation([0.15 * i / 60, 0.0, 0.0]) * p for i, p in enumerate(poses)]
+    found = align_to_slam(as_sfm(poses), drifting, seed=0)
+    assert found.n_used >= 50
+    assert found.threshold_m > 0.05
+    assert abs(found.map_from_sfm.scale * 3.7 - 1) < 0.02
+
+
+def test_gravity_comes_from_the_orientations_when_heights_drift(rng: np.random.Generator) -> None:
+    poses = walk(rng)
+    tilted = [Pose.from_translation([0.0, 0.0, 0.05 * p.translation[0]]) * p for p in poses]
+    found = align_to_slam(as_sfm(poses), tilted, seed=0)
+    assert found.gravity_deg < 1e-6
+    up = found.map_from_sfm.rotation.apply(ROTATION.apply([0.0, 0.0, 1.0]))
+    assert np.degrees(np.arccos(up[2])) < 1e-5
+
+
+def test_the_robust_fit_follows_from_the_seed(rng: np.random.Generator) -> None:
+    source = rng.normal(size=(30, 3))
+    target = source + rng.normal(0, 0.05, size=(30, 3))
+    fits = [robust_similarity(source, target, rng=np.random.default_rng(3)) for _ in range(2)]
+    assert fits[0][0].scale == fits[1][0].scale
+    assert fits[0][1] == fits[1][1]
+
+
+def test_alignment_needs_a_walk_and_poses() -> None:
+    still = [Pose.identity()] * 5
+    with pytest.raises(MapError, match="expected a walk"):
+        align_to_slam(still, still, seed=0)
+    with pytest.raises(MapError, match="2 mapped images have a SLAM pose; expected at least 3"):
+        align_to_slam(still[:2], still[:2], seed=0)
