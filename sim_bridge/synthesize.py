@@ -24,9 +24,11 @@ from fieldkit.store import (
 )
 from fieldkit.store.files import refuse_existing
 from fieldkit.types import TagMap, TagPose
-from sim_bridge import mapper, photographer, recorder, schedule, staging
 from sim_bridge.errors import SynthesisError
-from sim_bridge.scene import SCENES, Scene
+from sim_bridge.mapping import mapper, photographer
+from sim_bridge.recording import recorder, schedule
+from sim_bridge.scenes import SCENES, Scene
+from sim_bridge.stage import staging
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,8 +16,8 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import CameraError
 from fieldkit.frames import Pose
 from sim_bridge.mesh import Scene
-from sim_bridge.render import RENDERERS, render
-from sim_bridge.scene import SCENES
+from sim_bridge.rendering import RENDERERS, render
+from sim_bridge.scenes import SCENES
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose, yaw_pose
 from sim_bridge.mesh import Scene
-from sim_bridge.render import render
-from sim_bridge.scene import SCENES
+from sim_bridge.rendering import render
+from sim_bridge.scenes import SCENES
 
 SEEDS = (0, 1)
 

@@ -10,13 +10,14 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fieldkit.frames import Pose, pose_error
-from sim_bridge import mapper, robot
+from sim_bridge import robot
 from sim_bridge.aim import aim, facing, look_at
 from sim_bridge.errors import SynthesisError
+from sim_bridge.mapping import mapper
 from sim_bridge.mesh import Scene
-from sim_bridge.odometry import OdometryOptions, drifting_odometry
-from sim_bridge.paths import TrackBuilder, floor_graph, headings, plan_path, spaced
-from sim_bridge.schedule import ScheduleOptions, sweep_arms
+from sim_bridge.recording.schedule import ScheduleOptions, sweep_arms
+from sim_bridge.robot.odometry import OdometryOptions, drifting_odometry
+from sim_bridge.stage.paths import TrackBuilder, floor_graph, headings, plan_path, spaced
 
 
 def floor(blocks: list[tuple[float, float, float, float]]) -> Scene:

@@ -17,9 +17,12 @@ from fieldkit.frames import Pose, Trajectory, pose_error
 from fieldkit.store import read_camera, read_photos, read_rig, read_session, read_tags, read_tum
 from fieldkit.tags import tag_corners
 from fieldkit.types import Frame, Recording, Visit
-from sim_bridge import cli, mapper, photographer, recorder, robot, schedule, staging, synthesize
+from sim_bridge import cli, robot, synthesize
 from sim_bridge.errors import SynthesisError
-from sim_bridge.scene import SCENES, Scene
+from sim_bridge.mapping import mapper, photographer
+from sim_bridge.recording import recorder, schedule
+from sim_bridge.scenes import SCENES, Scene
+from sim_bridge.stage import staging
 from sim_bridge.synthesize import SessionOptions, generator
 
 # A robot in a hurry makes short recordings.

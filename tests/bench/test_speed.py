@@ -17,8 +17,8 @@ from fieldkit.replay import replay
 from fieldkit.surface import RayCaster
 from fieldkit.types import Candidates, Recording, SceneMap
 from fieldkit.views import landmark_statistics
-from sim_bridge.render import render
-from sim_bridge.scene import SCENES
+from sim_bridge.rendering import render
+from sim_bridge.scenes import SCENES
 
 SAMPLE = Path(__file__).resolve().parents[2] / "data_samples" / "room"
 

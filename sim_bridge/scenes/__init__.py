@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from sim_bridge.mesh import Scene
-from sim_bridge.rooms import furnished_room
+from sim_bridge.scenes.room import furnished_room
 
 __all__ = ["SCENES", "Scene"]
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
-from sim_bridge import effects
 from sim_bridge.aim import look_at
 from sim_bridge.errors import SynthesisError
-from sim_bridge.render import render
-from sim_bridge.scene import Scene
-from sim_bridge.staging import PlacedTag, Stage, clear_around, richness, sees, slant
+from sim_bridge.rendering import render
+from sim_bridge.scenes import Scene
+from sim_bridge.sensors import effects
+from sim_bridge.stage.staging import PlacedTag, Stage, clear_around, richness, sees, slant
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fieldkit.frames import Pose, yaw_pose
-from sim_bridge import furniture, textures
-from sim_bridge.build import Builder, Light
 from sim_bridge.mesh import Array, Scene
+from sim_bridge.scenes import furniture, textures
+from sim_bridge.scenes.build import Builder, Light
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 9.0, 7.0, 3.0
 WALL_DEPTH_M = 0.6

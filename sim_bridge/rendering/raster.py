@@ -15,7 +15,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from sim_bridge.kernels import kernel, parallel_kernel
+from sim_bridge.rendering.kernels import kernel, parallel_kernel
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

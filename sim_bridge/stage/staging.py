@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
 from fieldkit.tags import draw_tag
-from sim_bridge import effects, robot
+from sim_bridge import robot
 from sim_bridge.aim import facing, look_at
 from sim_bridge.errors import SynthesisError
-from sim_bridge.paths import FloorGraph, floor_graph
-from sim_bridge.render import render
-from sim_bridge.scene import Scene
+from sim_bridge.rendering import render
+from sim_bridge.scenes import Scene
+from sim_bridge.sensors import effects
+from sim_bridge.stage.paths import FloorGraph, floor_graph
 
 Array = NDArray[np.float64]
 

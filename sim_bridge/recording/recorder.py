@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from fieldkit.bags import RecordingWriter
 from fieldkit.bags.writing import BagFormat
 from fieldkit.frames import Pose
-from sim_bridge import effects, robot
-from sim_bridge.odometry import OdometryOptions, drifting_odometry
-from sim_bridge.render import render
-from sim_bridge.schedule import Schedule
-from sim_bridge.staging import Stage
+from sim_bridge import robot
+from sim_bridge.recording.schedule import Schedule
+from sim_bridge.rendering import render
+from sim_bridge.robot.odometry import OdometryOptions, drifting_odometry
+from sim_bridge.sensors import effects
+from sim_bridge.stage.staging import Stage
 
 Array = NDArray[np.float64]
 

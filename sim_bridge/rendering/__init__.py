@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from fieldkit.cameras import Camera
 from fieldkit.errors import CameraError
 from fieldkit.frames import Pose
-from sim_bridge import lens, raster
 from sim_bridge.mesh import Scene
+from sim_bridge.rendering import lens, raster
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class _Drawn:
 
 
 def render_numba(scene: Scene, camera: Camera, world_from_cam: Pose, *, samples: int = 4) -> Image:
-    """Render with the rasteriser of `sim_bridge.raster`, bent by `sim_bridge.lens` when the lens distorts."""
+    """Render with the rasteriser of `raster`, bent by `lens` when the camera's lens distorts."""
     cam_from_world = world_from_cam.inv().as_matrix()[:3]
     if camera.is_pinhole:
         drawn = _draw(scene, camera.matrix() @ cam_from_world, (camera.width, camera.height), samples=samples)

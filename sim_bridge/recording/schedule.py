@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from fieldkit.frames import Pose
 from fieldkit.types import ViewKind
 from sim_bridge import robot
-from sim_bridge.paths import SPACING_M, Track, TrackBuilder, floor_graph, headings, plan_path
-from sim_bridge.staging import Stage, StageOptions, Waypoint, clear_around, looking_at
+from sim_bridge.stage.paths import SPACING_M, Track, TrackBuilder, floor_graph, headings, plan_path
+from sim_bridge.stage.staging import Stage, StageOptions, Waypoint, clear_around, looking_at
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""What the mapping device and the photographer record."""

@@ -1,0 +1,1 @@
+"""What the robot does, senses and records."""

@@ -1,0 +1,1 @@
+"""The scene made ready for a field day: free floor, paths, tags and waypoints."""
