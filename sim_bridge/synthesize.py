@@ -26,8 +26,9 @@ from fieldkit.store.files import refuse_existing
 from fieldkit.types import TagMap, TagPose
 from sim_bridge.errors import SynthesisError
 from sim_bridge.mapping import mapper, photographer
+from sim_bridge.mesh import Scene
 from sim_bridge.recording import recorder, schedule
-from sim_bridge.scenes import SCENES, Scene
+from sim_bridge.scenes import make_scene
 from sim_bridge.stage import staging
 
 
@@ -57,15 +58,13 @@ def synthesize(
     format, or a scene without room for the session, and StoreError when the folder exists and ``force`` is not set.
     """
     chosen, out = options or SessionOptions(), Path(out)
-    if scene not in SCENES:
-        raise SynthesisError(f"unknown scene {scene!r}", hint=suggestion(scene, list(SCENES)))
     for wanted in formats or ("none",):
         if wanted not in recorder.RECORDINGS:
             raise SynthesisError(f"unknown format {wanted!r}", hint=suggestion(wanted, list(recorder.RECORDINGS)))
     if seed < 0:
         raise SynthesisError(f"seed {seed}; expected 0 or more", hint="choose another seed")
     refuse_existing(out, force=force, marker="session.toml", kind="folder")
-    room = SCENES[scene](seed)
+    room = make_scene(scene, seed)
     stage = staging.set_stage(room, chosen.stage, rng=generator(seed, 4))
     with atomic_folder(out, force=force, marker="session.toml") as folder:
         _write_mapping(folder, room, chosen.walk, seed=seed)

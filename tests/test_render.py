@@ -17,7 +17,7 @@ from fieldkit.errors import CameraError
 from fieldkit.frames import Pose
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import RENDERERS, render
-from sim_bridge.scenes import SCENES
+from sim_bridge.scenes import make_scene
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def empty_scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    return SCENES["room"](0)
+    return make_scene("room", 0)
 
 
 @pytest.fixture(scope="module")

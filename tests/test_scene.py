@@ -11,14 +11,14 @@ from fieldkit.cameras import Camera
 from fieldkit.frames import Pose, yaw_pose
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.scenes import SCENES
+from sim_bridge.scenes import make_scene
 
 SEEDS = (0, 1)
 
 
 @pytest.fixture(scope="module")
 def rooms() -> dict[int, Scene]:
-    return {seed: SCENES["room"](seed) for seed in SEEDS}
+    return {seed: make_scene("room", seed) for seed in SEEDS}
 
 
 def along(scene: Scene, *, step_m: float = 0.05) -> np.ndarray:
@@ -32,7 +32,7 @@ def along(scene: Scene, *, step_m: float = 0.05) -> np.ndarray:
 
 
 def test_the_same_seed_gives_the_same_scene_and_another_seed_another(rooms: dict[int, Scene]) -> None:
-    again = SCENES["room"](0)
+    again = make_scene("room", 0)
     for name in ("vertices", "faces", "uv", "texture", "shade", "blocks", "walk_xy", "closed"):
         assert np.array_equal(getattr(again, name), getattr(rooms[0], name)), name
     assert all(np.array_equal(a, b) for a, b in zip(again.textures, rooms[0].textures, strict=True))

@@ -20,8 +20,9 @@ from fieldkit.types import Frame, Recording, Visit
 from sim_bridge import cli, robot, synthesize
 from sim_bridge.errors import SynthesisError
 from sim_bridge.mapping import mapper, photographer
+from sim_bridge.mesh import Scene
 from sim_bridge.recording import recorder, schedule
-from sim_bridge.scenes import SCENES, Scene
+from sim_bridge.scenes import make_scene
 from sim_bridge.stage import staging
 from sim_bridge.synthesize import SessionOptions, generator
 
@@ -45,7 +46,7 @@ SEED = 1
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    return SCENES["room"](SEED)
+    return make_scene("room", SEED)
 
 
 @pytest.fixture(scope="module")

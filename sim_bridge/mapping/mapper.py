@@ -15,8 +15,8 @@ from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
 from fieldkit.store import Rig, RigCamera
 from sim_bridge.aim import UPRIGHT_FROM_CAM, turn
+from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.scenes import Scene
 from sim_bridge.sensors import effects
 
 Array = NDArray[np.float64]

@@ -13,8 +13,8 @@ from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
 from sim_bridge.aim import look_at
 from sim_bridge.errors import SynthesisError
+from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.scenes import Scene
 from sim_bridge.sensors import effects
 from sim_bridge.stage.staging import PlacedTag, Stage, clear_around, richness, sees, slant
 

@@ -1,11 +1,31 @@
-"""The scenes by name; a further scene is a builder and one line here."""
+"""The scenes by name; a further scene is a generator and one line here."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
+from fieldkit.errors import suggestion
+from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Scene
+from sim_bridge.scenes.blueprint import Blueprint
+from sim_bridge.scenes.light import lit
 from sim_bridge.scenes.room import furnished_room
 
-__all__ = ["SCENES", "Scene"]
+__all__ = ["SCENES", "make_blueprint", "make_scene"]
 
-# Name -> builder of the scene from a seed.
-SCENES: dict[str, Callable[[int], Scene]] = {"room": furnished_room}
+# Name -> generator of the scene from a seed.
+SCENES: dict[str, Callable[[int], Blueprint]] = {"room": furnished_room}
+
+
+def make_blueprint(name: str, seed: int) -> Blueprint:
+    """Make the blueprint of a scene by name; raises SynthesisError for a name that does not exist."""
+    if name not in SCENES:
+        raise SynthesisError(f"unknown scene {name!r}", hint=suggestion(name, list(SCENES)))
+    return SCENES[name](seed)
+
+
+def make_scene(name: str, seed: int) -> Scene:
+    """Make a scene by name, lit as when it is mapped; the same name and seed give the same scene."""
+    return lit(make_blueprint(name, seed), rng=np.random.default_rng([seed, 90709]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from fieldkit.frames import Pose, yaw_pose
 from sim_bridge.scenes import textures
-from sim_bridge.scenes.build import Builder
+from sim_bridge.scenes.blueprint import Builder
 
 _WOODS = ((178, 140, 98), (120, 84, 58), (205, 190, 165), (92, 70, 55), (150, 150, 150))
 

@@ -20,9 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fieldkit.frames import Pose, yaw_pose
-from sim_bridge.mesh import Array, Scene
+from sim_bridge.mesh import Array
 from sim_bridge.scenes import furniture, textures
-from sim_bridge.scenes.build import Builder, Light
+from sim_bridge.scenes.blueprint import Blueprint, Builder
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 9.0, 7.0, 3.0
 WALL_DEPTH_M = 0.6
@@ -33,7 +33,7 @@ _MIDDLE_M = LENGTH_M / 2
 _ISLANDS = ((1.75, 1.75, 3.95, 5.25), (5.05, 1.75, 7.25, 5.25))
 
 
-def furnished_room(seed: int) -> Scene:
+def furnished_room(seed: int) -> Blueprint:
     """Make the room of 9 x 7 x 3 m; the same seed gives the same room.
 
     The floor is at z = 0 and the walls stand at x = 0, 9 and y = 0, 7. `Scene.walk_xy` runs around both islands and
@@ -47,9 +47,8 @@ def furnished_room(seed: int) -> Scene:
         _furnish_wall(build, rng, wall, kind="blank" if wall == blank else "rich")
     for island in _ISLANDS:
         _furnish_island(build, rng, island)
-    lamps = _lamps(build)
-    walk = _walk()
-    return build.build(rng, Light(lamps), walk_xy=walk, floor_bounds=(0.0, 0.0, LENGTH_M, WIDTH_M))
+    _lamps(build)
+    return build.blueprint(floor_bounds=(0.0, 0.0, LENGTH_M, WIDTH_M), walk_xy=_walk())
 
 
 def _wall_place(wall: int) -> tuple[Pose, float]:
@@ -87,13 +86,10 @@ def _shell(build: Builder, rng: np.random.Generator) -> None:
     build.panel(spot, (1.4, 0.95), rug, cell_m=0.125, solid=False)
 
 
-def _lamps(build: Builder) -> Array:
-    white = build.plain((255, 253, 246))
-    spots = [(x, y) for x in (1.8, 4.5, 7.2) for y in (1.9, 5.1)]
-    for x, y in spots:
+def _lamps(build: Builder) -> None:
+    for x, y in [(x, y) for x in (1.8, 4.5, 7.2) for y in (1.9, 5.1)]:
         under = Pose.from_components([x, y, HEIGHT_M - 0.03], Rotation.from_euler("x", np.pi))
-        build.panel(under, (1.2, 0.3), white, solid=False, glow=1.0)
-    return np.array([[x, y, HEIGHT_M - 0.04] for x, y in spots])
+        build.lamp(under, (1.2, 0.3), samples=(1, 1))
 
 
 def _furnish_wall(build: Builder, rng: np.random.Generator, wall: int, *, kind: str) -> None:

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from sim_bridge.errors import SynthesisError
-from sim_bridge.scenes import Scene
+from sim_bridge.mesh import Scene
 
 Array = NDArray[np.float64]
 

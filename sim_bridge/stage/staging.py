@@ -15,8 +15,8 @@ from fieldkit.tags import draw_tag
 from sim_bridge import robot
 from sim_bridge.aim import facing, look_at
 from sim_bridge.errors import SynthesisError
+from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.scenes import Scene
 from sim_bridge.sensors import effects
 from sim_bridge.stage.paths import FloorGraph, floor_graph
 

@@ -18,7 +18,7 @@ from fieldkit.surface import RayCaster
 from fieldkit.types import Candidates, Recording, SceneMap
 from fieldkit.views import landmark_statistics
 from sim_bridge.rendering import render
-from sim_bridge.scenes import SCENES
+from sim_bridge.scenes import make_scene
 
 SAMPLE = Path(__file__).resolve().parents[2] / "data_samples" / "room"
 
@@ -69,7 +69,7 @@ def test_rank_a_hundred_candidates(
 
 
 def test_render_a_view(benchmark: Any, recording: Recording) -> None:
-    scene, camera = SCENES["room"](0), recording.frames[0].camera
+    scene, camera = make_scene("room", 0), recording.frames[0].camera
     from scipy.spatial.transform import Rotation
 
     level = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
