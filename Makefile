@@ -5,7 +5,7 @@ DEMO := build/demo
 SCENE ?= room
 SEED ?= 0
 
-.PHONY: install demo test bench lint sample redkitchen clean
+.PHONY: install demo test judges bench lint sample redkitchen clean
 
 install: .venv/installed
 
@@ -27,6 +27,14 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest
+
+# Foreign readers for tests/test_foreign_judges.py, which skips without them: Foxglove's, into tests/judges/node_modules,
+# and ROS 1's own, which Debian has: apt-get install python3-rosbag python3-{std,sensor,nav,geometry,tf2}-msgs
+judges: tests/judges/node_modules/.package-lock.json
+
+tests/judges/node_modules/.package-lock.json: tests/judges/package-lock.json
+	npm ci --silent --prefix tests/judges
+	touch $@
 
 bench: install
 	$(BIN)/python -m pytest tests/bench --benchmark-enable --benchmark-only
