@@ -1,1 +1,37 @@
-"""What sensors add to rendered images."""
+"""What sensors add to exact renderings."""
+
+from sim_bridge.sensors.colour import expose
+from sim_bridge.sensors.depth import sense_depth
+from sim_bridge.sensors.effects import encode
+from sim_bridge.sensors.models import (
+    IDEAL,
+    LENSES,
+    PRESETS,
+    STANDARD,
+    ColourSensor,
+    DepthSensor,
+    Motion,
+    Sensors,
+    bent,
+    load_sensors,
+    without,
+    write_sensors,
+)
+
+__all__ = [
+    "IDEAL",
+    "LENSES",
+    "PRESETS",
+    "STANDARD",
+    "ColourSensor",
+    "DepthSensor",
+    "Motion",
+    "Sensors",
+    "bent",
+    "encode",
+    "expose",
+    "load_sensors",
+    "sense_depth",
+    "without",
+    "write_sensors",
+]

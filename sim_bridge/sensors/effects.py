@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.sensors.models import ColourSensor
+
 Image = NDArray[np.uint8]
 
 
@@ -36,6 +38,11 @@ def jpeg(image: Image, *, quality: int) -> bytes:
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
     ]
     return bytes(cv2.imencode(".jpg", data, settings)[1])
+
+
+def encode(image: Image, sensor: ColourSensor) -> bytes:
+    """Encode an image as the JPEG file of a sensor, of quality 100 where the sensor has no compression."""
+    return jpeg(image, quality=100 if sensor.jpeg is None else sensor.jpeg.quality)
 
 
 def depth_png(depth_m: NDArray[np.float32], *, far_m: float) -> bytes:
