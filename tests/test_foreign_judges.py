@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from bag_samples import CAMERA, HAND_FROM_CAM, STEP, T0, body_from_hand, jpeg, odom_from_body, picture
+
 from fieldkit.bags import BagFormat, RecordingWriter
 from fieldkit.bags.layouts import LAYOUTS, Layout
 from fieldkit.frames import Pose, position_quaternion
