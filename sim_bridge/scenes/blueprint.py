@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from fieldkit.frames import Pose
 from sim_bridge.mesh import Array, Rgb, box_quads
 
-FULL_UV = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+# Left, top, right and bottom of the whole of a texture.
+FULL_UV = (0.0, 0.0, 1.0, 1.0)
 
 
 # What a change of the world may do: nothing to the building and fixed things; move, remove or add movable things;
@@ -46,7 +47,7 @@ class Lamp:
 class Quad:
     """A rectangle: corners f64[4,3] (top left first, then right, clockwise as seen), normal, texture and light.
 
-    ``thing`` is the index of what it belongs to.
+    ``thing`` is the index of what it belongs to; ``uv`` the part of the texture that it shows.
     """
 
     corners: Array
@@ -57,6 +58,7 @@ class Quad:
     closed: bool
     glow: float | None
     thing: int = 0
+    uv: tuple[float, float, float, float] = FULL_UV
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,16 +134,19 @@ class Builder:
         cell_m: float = 0.25,
         solid: bool = True,
         glow: float | None = None,
+        uv: tuple[float, float, float, float] = FULL_UV,
     ) -> None:
         """Add a rectangle of (width, height) centred on a pose, x right, y up, facing +z.
 
         A panel that is not ``solid`` casts no shadow and is seen from both sides (a picture); ``glow`` is a
-        fixed brightness.
+        fixed brightness. ``uv`` (left, top, right, bottom) is the part of the texture that it shows.
         """
         x, y = size_m[0] / 2, size_m[1] / 2
         corners = world_from_quad.apply(np.array([[-x, y, 0.0], [x, y, 0.0], [x, -y, 0.0], [-x, -y, 0.0]]))
         normal = world_from_quad.rotation.apply([0.0, 0.0, 1.0])
-        self.quads.append(Quad(corners, normal, texture, cell_m, solid, closed=solid, glow=glow, thing=self._thing))
+        self.quads.append(
+            Quad(corners, normal, texture, cell_m, solid, closed=solid, glow=glow, thing=self._thing, uv=uv)
+        )
 
     def box(
         self,

@@ -78,7 +78,9 @@ def _grid(quad: Quad) -> _Grid:
     step = cols + 1
     upper = np.stack([first, first + 1, first + step + 1], axis=1)
     lower = np.stack([first, first + step + 1, first + step], axis=1)
-    return _Grid(points, np.stack([u, v], axis=1), np.concatenate([upper, lower]))
+    left, top, right, bottom = quad.uv
+    uv = np.stack([left + u * (right - left), top + v * (bottom - top)], axis=1)
+    return _Grid(points, uv, np.concatenate([upper, lower]))
 
 
 def bake(

@@ -23,6 +23,7 @@ from fieldkit.frames import Pose, yaw_pose
 from sim_bridge.mesh import Array
 from sim_bridge.scenes import furniture, textures
 from sim_bridge.scenes.blueprint import Blueprint, Builder
+from sim_bridge.scenes.plan import on_wall
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 9.0, 7.0, 3.0
 WALL_DEPTH_M = 0.6
@@ -56,12 +57,6 @@ def _wall_place(wall: int) -> tuple[Pose, float]:
     x, y = LENGTH_M / 2, WIDTH_M / 2
     origin = [(x, 0.0, 0.0), (LENGTH_M, y, 0.0), (x, WIDTH_M, 0.0), (0.0, y, 0.0)][wall]
     return yaw_pose(origin, wall * np.pi / 2), (LENGTH_M, WIDTH_M)[wall % 2]
-
-
-def on_wall(place: Pose, along_m: float, up_m: float, *, off_m: float) -> Pose:
-    """Return the pose of a picture on a wall: x right, y up, z into the room, off the wall by off_m."""
-    facing = Rotation.from_matrix([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-    return place * Pose.from_components([along_m, off_m, up_m], facing)
 
 
 def _shell(build: Builder, rng: np.random.Generator) -> None:
