@@ -6,7 +6,6 @@ true and the mapped mapping cameras; its residual is the gauge, and everything e
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,11 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from fieldkit import maps, store
 from fieldkit.errors import FrameError, JudgeError
 from fieldkit.frames import Pose, Trajectory, log, pose_error
+from fieldkit.maps import Gauge, fit_gauge
 from fieldkit.surface import read_ply
 from fieldkit.types import Run, SceneMap, Surface, TagMap, ViewResult
 
@@ -27,16 +26,6 @@ Array = NDArray[np.float64]
 # world_from_cam by session, visit and view.
 Cameras = Mapping[tuple[str, str, str], Pose]
 LANDMARK_SAMPLE = 5000
-
-
-@dataclasses.dataclass(frozen=True)
-class Gauge:
-    """The rigid transform world_from_map, and what it leaves of the mapping cameras' positions (m)."""
-
-    world_from_map: Pose
-    rms_m: float
-    max_m: float
-    scale_error: float
 
 
 def judge(session: Path, *, map_path: Path, tags_path: Path | None, run_path: Path | None = None) -> dict[str, Any]:
@@ -81,27 +70,6 @@ def _refuse_other_map(what: str, digest: str, scene_map: SceneMap, *, hint: str)
             f"{what} in the map {digest[:12]}; expected {scene_map.digest[:12]}, the digest of {scene_map.path}",
             hint=hint,
         )
-
-
-def fit_gauge(scene_map: SceneMap, true_cameras: Mapping[str, Pose]) -> Gauge:
-    """Fit world_from_map to the positions of the mapping cameras (Kabsch, no scale); scale is only measured."""
-    pairs = [
-        (p.translation, true_cameras[name].translation)
-        for name, p in zip(scene_map.image_names, scene_map.map_from_image, strict=True)
-        if name in true_cameras
-    ]
-    if len(pairs) < 3:
-        raise JudgeError(
-            f"{scene_map.path}: shares {len(pairs)} images with the session's truth; expected its mapping images",
-            hint="judge a map that was built from this session's mapping/ folder",
-        )
-    mapped, true = (np.array(side) for side in zip(*pairs, strict=True))
-    centred, target = mapped - mapped.mean(axis=0), true - true.mean(axis=0)
-    rotation, _ = Rotation.align_vectors(target, centred)
-    world_from_map = Pose.from_components(true.mean(axis=0) - rotation.apply(mapped.mean(axis=0)), rotation)
-    residual = np.linalg.norm(world_from_map.apply(mapped) - true, axis=1)
-    scale = float(np.sum(target * rotation.apply(centred)) / np.sum(centred**2))
-    return Gauge(world_from_map, float(np.sqrt(np.mean(residual**2))), float(residual.max()), 1.0 / scale - 1.0)
 
 
 def _landmark_median(scene_map: SceneMap, gauge: Gauge, path: Path) -> float | None:

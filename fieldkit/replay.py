@@ -8,7 +8,6 @@ recording -> prior at each visit -> candidate views at the prior -> utilities ->
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,14 +22,12 @@ from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer
 from fieldkit.prior import estimate_prior
 from fieldkit.protocol import Protocol
-from fieldkit.surface import RayCaster
 from fieldkit.truth import estimate_truths
 from fieldkit.types import (
     Candidates,
     Estimate,
     Excluded,
     Image,
-    PlanView,
     Prior,
     Recording,
     Run,
@@ -43,15 +40,13 @@ from fieldkit.types import (
     Visit,
     VisitPlan,
 )
-from fieldkit.views import forward_directions, landmark_statistics, recorded_candidates
+from fieldkit.views import forward_directions, plan_view, recorded_candidates
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 THUMBNAIL_PX = 240
 # What leaves a visit out, with its reason; any other error ends the replay.
 EXCLUDING = (PriorError, TruthError, FrameError, ReplayError, TagError)
-PLAN_LANDMARKS = 6000
-LIBRARIES = ("fieldkit", "numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "pupil-apriltags", "rosbags")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +84,7 @@ def replay(
     if not recordings:
         raise ReplayError("no recording given; expected at least one", hint="name a bag or a session folder")
     scene_map = maps.load_map(map_path)
-    check_map(scene_map, protocol)
+    policies.check_map(scene_map, protocol)
     tags = _load_tags(tags_path, scene_map)
     cache = store.EstimateCache(Path(out).parent / f".{Path(out).name}.estimates.jsonl")
     opened = [open_recording(path) for path in recordings]
@@ -102,23 +97,6 @@ def replay(
     store.write_run(out, run, force=force)
     cache.remove()
     return run
-
-
-def check_map(scene_map: SceneMap, protocol: Protocol) -> None:
-    """Raise ReplayError when a map cannot serve a protocol: another feature, or no surface to test occlusion."""
-    if scene_map.feature != protocol.feature:
-        raise ReplayError(
-            f"{scene_map.path}: made with feature {scene_map.feature!r}; the protocol {protocol.name} expects "
-            f"{protocol.feature!r}",
-            hint=f"build the map with --feature {protocol.feature}, or change the protocol",
-        )
-    counting = [p for p in protocol.policies if p in policies.POLICIES and policies.POLICIES[p].counts_landmarks]
-    if counting and True in protocol.occlusion.use and scene_map.surface is None:
-        raise ReplayError(
-            f"{scene_map.path}: has no surface; expected surface.ply, since the protocol {protocol.name} asks for the "
-            "occlusion filter",
-            hint="build the map with depth images, or set occlusion.use = [false] in the protocol",
-        )
 
 
 def _load_tags(path: Path | None, scene_map: SceneMap) -> TagMap:
@@ -193,7 +171,7 @@ def _replay_session(
         log.warning("%s: %s", recording.path, warning)
     ready, excluded = _prepare(recording, tags, protocol)
     localizer = Localizer(scene_map, protocol.localizer, seed=protocol.seed)
-    look = _Looker(scene_map, protocol)
+    look = policies.Looker(scene_map, protocol)
     parts = []
     for number, (visit_id, known) in enumerate(ready.items(), start=1):
         if progress is not None:
@@ -279,42 +257,6 @@ def _prior_error(recording: Recording, prior: Prior, truths: Mapping[str, Truth]
     return pose_error(prior.map_from_body, map_from_body * moved)
 
 
-class _Looker:
-    """Compute every policy's utilities of candidates; landmark statistics and rays are made once per map."""
-
-    def __init__(self, scene_map: SceneMap, protocol: Protocol) -> None:
-        self._map = scene_map
-        self._protocol = protocol
-        self._statistics = landmark_statistics(scene_map)
-        self._rays = None if scene_map.surface is None else RayCaster(scene_map.surface)
-
-    def utilities(self, candidates: Candidates) -> dict[tuple[str, bool | None], policies.Array]:
-        """Return utilities f64[v] per policy and occlusion (None where the policy counts no landmarks)."""
-        scenes = {use: self._scene(candidates, occlusion=use) for use in {False, *self._protocol.occlusion.use}}
-        result: dict[tuple[str, bool | None], policies.Array] = {}
-        for name in self._protocol.policies:
-            if name in policies.NOT_RANKED:
-                continue
-            policy = policies.available(name)
-            if policy.counts_landmarks:
-                for use in self._protocol.occlusion.use:
-                    result[name, use] = policies.utility(policy, scenes[use])
-            else:
-                result[name, None] = policies.utility(policy, scenes[False])
-        return result
-
-    def _scene(self, candidates: Candidates, *, occlusion: bool) -> policies.Scene:
-        voxel_m = self._map.surface.voxel_m if self._map.surface is not None else 0.0
-        return policies.look_at(
-            self._map,
-            self._statistics,
-            candidates,
-            rules=self._protocol.candidates,
-            rays=self._rays if occlusion else None,
-            tolerance_m=self._protocol.occlusion.tolerance_voxels * voxel_m,
-        )
-
-
 def _score_visit(
     plan: VisitPlan,
     views: Mapping[str, View],
@@ -327,7 +269,7 @@ def _score_visit(
 ) -> _Session:
     results: dict[str, ViewResult] = {}
     thumbnails: dict[str, bytes] = {}
-    settings = repr((map_digest, protocol.feature, protocol.localizer, protocol.seed, _versions()))
+    settings = repr((map_digest, protocol.feature, protocol.localizer, protocol.seed, store.library_versions()))
     for view in views.values():
         image = view.frame.read()
         estimate = _localize_once(image, view, localizer, cache=cache, settings=settings)
@@ -372,30 +314,12 @@ def _collect(
         recordings=tuple(r.path for r in recordings),
         sessions=tuple(r.name for r in recordings),
         seed=protocol.seed,
-        versions=_versions(),
+        versions=store.library_versions(),
         trials=tuple(t for s in sessions for t in s.trials),
         results=tuple(r for s in sessions for r in s.results),
         truths=tuple((r.name, t) for r, s in zip(recordings, sessions, strict=True) for t in s.truths),
         plans=tuple(p for s in sessions for p in s.plans),
-        plan_view=_plan_view(scene_map, protocol),
+        plan_view=plan_view(scene_map, seed=protocol.seed),
         thumbnails={k: v for s in sessions for k, v in s.thumbnails.items()},
         excluded=tuple(e for s in sessions for e in s.excluded),
     )
-
-
-def _versions() -> dict[str, str]:
-    return {name: _version(name) for name in LIBRARIES}
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
-
-
-def _plan_view(scene_map: SceneMap, protocol: Protocol) -> PlanView:
-    rng = np.random.default_rng(protocol.seed)
-    keep = np.sort(rng.permutation(len(scene_map.xyz))[:PLAN_LANDMARKS])
-    cameras = np.array([p.translation for p in scene_map.map_from_image], dtype=np.float32).reshape(-1, 3)
-    return PlanView(scene_map.xyz[keep].astype(np.float32), cameras)

@@ -12,9 +12,10 @@ from fieldkit.errors import ReplayError
 from fieldkit.frames import Pose
 from fieldkit.protocol import CandidateRules
 from fieldkit.surface import RayCaster
-from fieldkit.types import Candidates, LandmarkStatistics, Prior, Recording, SceneMap, Visit
+from fieldkit.types import Candidates, LandmarkStatistics, PlanView, Prior, Recording, SceneMap, Visit
 
 Array = NDArray[np.float64]
+PLAN_LANDMARKS = 6000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,3 +178,11 @@ def _drop_hidden(
         for m in members:
             result[m] = inside[m][visible[inside[m]]]
     return result
+
+
+def plan_view(scene_map: SceneMap, *, seed: int) -> PlanView:
+    """Thin a map to what is drawn from above: up to 6000 landmarks, chosen by the seed, and all mapping cameras."""
+    rng = np.random.default_rng(seed)
+    keep = np.sort(rng.permutation(len(scene_map.xyz))[:PLAN_LANDMARKS])
+    cameras = np.array([p.translation for p in scene_map.map_from_image], dtype=np.float32).reshape(-1, 3)
+    return PlanView(scene_map.xyz[keep].astype(np.float32), cameras)

@@ -28,6 +28,7 @@ from fieldkit.store.inputs import (
 )
 from fieldkit.store.runs import EstimateCache, read_run, write_run
 from fieldkit.store.tags import read_tags, write_tags
+from fieldkit.store.versions import library_versions
 
 __all__ = [
     "EstimateCache",
@@ -38,6 +39,7 @@ __all__ = [
     "atomic_folder",
     "atomic_write",
     "digest",
+    "library_versions",
     "plain_json",
     "read_camera",
     "read_json",
