@@ -5,16 +5,24 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Collection
+from typing import Any
 
 from fieldkit.errors import BagError, suggestion
 
 # Stands for the robot's own name, which some drivers put in front of every topic and frame
 ROBOT = "{robot}"
+# The names of Spot's description and of its ROS 2 driver
+_JOINTS = tuple(f"arm_{joint}" for joint in ("sh0", "sh1", "el0", "el1", "wr0", "wr1"))
+_LINKS = tuple(joint.replace("arm_", "arm_link_") for joint in _JOINTS)
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where a recording keeps what: topics and frames; ``{robot}`` in them stands for the robot's name."""
+    """Where a recording keeps what: topics, frames and joints; ``{robot}`` in them stands for the robot's name.
+
+    ``arm_frames`` are the links of the arm that tf moves, from the body outwards, the last one with the cameras; a
+    driver that gives the wrist in the body names it alone. ``arm_joints`` are their names in joint states.
+    """
 
     name: str
     image: str
@@ -26,14 +34,25 @@ class Layout:
     events: str = "/fieldkit/events"
     reference: str = "/fieldkit/reference"
     joint_states: str = "/joint_states"
+    depth: str = "/arm_camera/depth/image_raw"
+    depth_compressed: str = "/arm_camera/depth/image/compressed"
+    depth_info: str = "/arm_camera/depth/camera_info"
     odom_frame: str = "odom"
     body_frame: str = "body"
     camera_frame: str = "arm_camera"
+    depth_frame: str = "arm_depth"
+    arm_frames: tuple[str, ...] = _LINKS
+    arm_joints: tuple[str, ...] = _JOINTS
 
     def named(self, robot: str) -> Layout:
         """Return the layout with the robot's name filled in."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return Layout(**{key: value.replace(ROBOT, robot) for key, value in values.items()})
+
+        def filled(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
+            parts = [part.replace(ROBOT, robot) for part in ((value,) if isinstance(value, str) else value)]
+            return parts[0] if isinstance(value, str) else tuple(parts)
+
+        values: dict[str, Any] = {f.name: filled(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        return Layout(**values)
 
 
 LAYOUTS: dict[str, Layout] = {
@@ -50,7 +69,14 @@ LAYOUTS: dict[str, Layout] = {
         compressed="/spot/camera/hand_color/image/compressed",
         camera_info="/spot/camera/hand_color/camera_info",
         odometry="/spot/odometry",
+        depth="/spot/depth/hand/image",
+        depth_compressed="/spot/depth/hand/image/compressed",
+        depth_info="/spot/depth/hand/camera_info",
+        odom_frame="vision",
         camera_frame="hand_color_image_sensor",
+        depth_frame="hand_depth_sensor",
+        arm_frames=("link_wr1",),
+        arm_joints=tuple(f"arm_joint{number}" for number in range(1, 7)),
     ),
     "spot_ros2": Layout(
         name="spot_ros2",
@@ -59,9 +85,15 @@ LAYOUTS: dict[str, Layout] = {
         camera_info="/{robot}/camera/hand/camera_info",
         odometry="/{robot}/odometry",
         joint_states="/{robot}/joint_states",
+        depth="/{robot}/depth/hand/image",
+        depth_compressed="/{robot}/depth/hand/image/compressed",
+        depth_info="/{robot}/depth/hand/camera_info",
         odom_frame="{robot}/odom",
         body_frame="{robot}/body",
         camera_frame="{robot}/hand_color_image_sensor",
+        depth_frame="{robot}/hand_depth_sensor",
+        arm_frames=tuple(f"{ROBOT}/{link}" for link in _LINKS),
+        arm_joints=tuple(f"{ROBOT}/{joint}" for joint in _JOINTS),
     ),
 }
 

@@ -225,26 +225,24 @@ class RecordingWriter:
 
     def camera_info(self, t_ns: int, camera: Camera) -> None:
         """Write the arm camera's calibration; pixels go half a pixel down to ROS' convention."""
-        k, d, model = camera_info_fields(camera)
-        p = [k[0], k[1], k[2], 0.0, k[3], k[4], k[5], 0.0, k[6], k[7], k[8], 0.0]
-        matrices: dict[str, Any] = {"d": d, "k": k, "r": np.eye(3).ravel(), "p": p}
-        if self.format == "ros1":
-            matrices = {key.upper(): value for key, value in matrices.items()}
-        region = self._make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
+        self._calibration(self.layout.camera_info, self.layout.camera_frame, t_ns, camera)
+
+    def depth(self, t_ns: int, png: bytes) -> None:
+        """Write a depth image (16-bit PNG, mm, 0 where there is none) as sensor_msgs/CompressedImage.
+
+        It is what image_transport's plugin ``compressed`` makes of a 16UC1 image.
+        """
         message = self._make(
-            "sensor_msgs/msg/CameraInfo",
-            header=self._header(t_ns, self.layout.camera_frame),
-            height=camera.height,
-            width=camera.width,
-            distortion_model=model,
-            **{key: np.asarray(value, dtype=np.float64) for key, value in matrices.items()},
-            binning_x=0,
-            binning_y=0,
-            roi=region,
+            "sensor_msgs/msg/CompressedImage",
+            header=self._header(t_ns, self.layout.depth_frame),
+            format="16UC1; png compressed",
+            data=np.frombuffer(png, dtype=np.uint8),
         )
-        self._write(self.layout.camera_info, message, t_ns)
+        self._write(self.layout.depth_compressed, message, t_ns)
+
+    def depth_info(self, t_ns: int, camera: Camera) -> None:
+        """Write the depth camera's calibration, like `camera_info`."""
+        self._calibration(self.layout.depth_info, self.layout.depth_frame, t_ns, camera)
 
     def odometry(self, t_ns: int, odom_from_body: Pose, twist: ArrayLike | None = None) -> None:
         """Write the robot's odometry; ``twist`` (6,) is linear (m/s), then angular (rad/s) velocity in the body."""
@@ -304,6 +302,28 @@ class RecordingWriter:
             effort=np.zeros(0),
         )
         self._write(self.layout.joint_states, message, t_ns)
+
+    def _calibration(self, topic: str, frame: str, t_ns: int, camera: Camera) -> None:
+        k, d, model = camera_info_fields(camera)
+        p = [k[0], k[1], k[2], 0.0, k[3], k[4], k[5], 0.0, k[6], k[7], k[8], 0.0]
+        matrices: dict[str, Any] = {"d": d, "k": k, "r": np.eye(3).ravel(), "p": p}
+        if self.format == "ros1":
+            matrices = {key.upper(): value for key, value in matrices.items()}
+        region = self._make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        message = self._make(
+            "sensor_msgs/msg/CameraInfo",
+            header=self._header(t_ns, frame),
+            height=camera.height,
+            width=camera.width,
+            distortion_model=model,
+            **{key: np.asarray(value, dtype=np.float64) for key, value in matrices.items()},
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+        )
+        self._write(topic, message, t_ns)
 
     def _written(self) -> _Open:
         if self._open is None:
