@@ -79,8 +79,8 @@ def wall(
     height_m: float,
     thickness_m: float = THICKNESS_M,
     openings: Sequence[Opening] = (),
-    left: int,
-    right: int,
+    left: int | None,
+    right: int | None,
     trim: int | None = None,
     cell_m: float = 0.25,
 ) -> None:
@@ -88,7 +88,7 @@ def wall(
 
     ``left`` and ``right`` are the textures of its faces as one walks from start to end. A texture spans the whole
     face (seen from its own side, first row at the ceiling), and a part of the wall shows its part. ``trim`` is the
-    texture of a skirting board. Walls of one thickness may end on each other's line: both ends reach half a
+    texture of a skirting board. A face that nobody sees may be None. Walls of one thickness may end on each other's line: both ends reach half a
     thickness (less 1 mm, so that no faces coincide) beyond it. Raises ValueError for openings that do not fit.
     """
     line = np.asarray(end_xy, dtype=np.float64) - np.asarray(start_xy, dtype=np.float64)
@@ -112,9 +112,12 @@ def wall(
         for bottom, top in parts:
             if top - bottom > 1e-6:
                 body.faces(build, (start, stop), (bottom, top), textures=(left, right), cell_m=cell_m)
+    inner = left if left is not None else right
+    if inner is None:
+        raise ValueError("a wall needs at least one face")
     for hole in holes:
-        body.reveal(build, hole, left)
-    body.caps(build, left)
+        body.reveal(build, hole, inner)
+    body.caps(build, inner)
     passages = [o for o in holes if o.bottom_m == 0.0]
     ends = [
         -body.reach_m,
@@ -154,22 +157,21 @@ class _Wall:
         along: tuple[float, float],
         up: tuple[float, float],
         *,
-        textures: tuple[int, int],
+        textures: tuple[int | None, int | None],
         cell_m: float,
     ) -> None:
         s, z = sum(along) / 2, sum(up) / 2
         size = (along[1] - along[0], up[1] - up[0])
         u0, v0, u1, v1 = self.uv(along, up)
         off = self.thickness_m / 2
-        build.panel(
-            on_wall(self.frame, s, z, off_m=off),
-            size,
-            textures[0],
-            cell_m=cell_m,
-            uv=(1 - u1, v0, 1 - u0, v1),
-        )
-        back = self.frame * yaw_pose([s, 0.0, 0.0], np.pi)
-        build.panel(on_wall(back, 0.0, z, off_m=off), size, textures[1], cell_m=cell_m, uv=(u0, v0, u1, v1))
+        if textures[0] is not None:
+            front = on_wall(self.frame, s, z, off_m=off)
+            build.panel(front, size, textures[0], cell_m=cell_m, uv=(1 - u1, v0, 1 - u0, v1))
+        if textures[1] is not None:
+            back = self.frame * yaw_pose([s, 0.0, 0.0], np.pi)
+            build.panel(
+                on_wall(back, 0.0, z, off_m=off), size, textures[1], cell_m=cell_m, uv=(u0, v0, u1, v1)
+            )
 
     def reveal(self, build: Builder, hole: Opening, texture: int) -> None:
         top = min(hole.top_m, self.height_m)
