@@ -29,6 +29,7 @@ from sim_bridge.mapping import mapper, photographer
 from sim_bridge.mesh import Scene
 from sim_bridge.recording import recorder, schedule
 from sim_bridge.scenes import make_scene
+from sim_bridge.sensors import STANDARD, Sensors, write_sensors
 from sim_bridge.stage import staging
 
 
@@ -41,6 +42,7 @@ class SessionOptions:
     photos: photographer.PhotoOptions = dataclasses.field(default_factory=photographer.PhotoOptions)
     schedule: schedule.ScheduleOptions = dataclasses.field(default_factory=schedule.ScheduleOptions)
     recorder: recorder.RecorderOptions = dataclasses.field(default_factory=recorder.RecorderOptions)
+    sensors: Sensors = STANDARD
 
 
 def synthesize(
@@ -67,8 +69,9 @@ def synthesize(
     room = make_scene(scene, seed)
     stage = staging.set_stage(room, chosen.stage, rng=generator(seed, 4))
     with atomic_folder(out, force=force, marker="session.toml") as folder:
-        _write_mapping(folder, room, chosen.walk, seed=seed)
-        _write_photos(folder, stage, chosen.photos, seed=seed)
+        write_sensors(folder / "sensors.toml", chosen.sensors)
+        _write_mapping(folder, room, chosen, seed=seed)
+        _write_photos(folder, stage, chosen, seed=seed)
         _write_robot(folder, stage, chosen, formats, seed=seed)
         _write_surface(folder / "truth" / "surface.ply", room)
         _write_tags(folder / "truth" / "tags.toml", stage)
@@ -81,26 +84,28 @@ def generator(seed: int, part: int) -> np.random.Generator:
     return np.random.default_rng([seed, part])
 
 
-def _write_mapping(folder: Path, scene: Scene, options: mapper.WalkOptions, *, seed: int) -> None:
-    stations = mapper.walk(scene, options, rng=generator(seed, 1))
-    mapping = folder / "mapping"
-    write_rig(mapping / "rig.toml", mapper.hololens_rig())
+def _write_mapping(folder: Path, scene: Scene, options: SessionOptions, *, seed: int) -> None:
+    stations = mapper.walk(scene, options.walk, rng=generator(seed, 1))
+    mapping, sensors = folder / "mapping", options.sensors
+    write_rig(mapping / "rig.toml", mapper.hololens_rig(sensors.mapping))
     write_tum(mapping / "slam_poses.txt", [(s.frame, s.slam_from_rig) for s in stations])
     truth = []
-    for name, world_from_cam, data in mapper.images(scene, stations, options, rng=generator(seed, 2)):
+    for name, world_from_cam, data in mapper.images(scene, stations, sensors.mapping, rng=generator(seed, 2)):
         _write(mapping / "images" / name, data)
         truth.append((name, world_from_cam))
-    for name, data in mapper.depths(scene, stations, options, rng=generator(seed, 3)):
+    for name, data in mapper.depths(scene, stations, sensors.mapping_depth, rng=generator(seed, 3)):
         _write(mapping / "depth" / name, data)
     write_tum(folder / "truth" / "mapping_poses.txt", truth)
 
 
-def _write_photos(folder: Path, stage: staging.Stage, options: photographer.PhotoOptions, *, seed: int) -> None:
-    planned = photographer.plan_photos(stage, options, rng=generator(seed, 5))
-    write_camera(folder / "photos" / photographer.CAMERA_FILE, photographer.camera(options))
+def _write_photos(folder: Path, stage: staging.Stage, options: SessionOptions, *, seed: int) -> None:
+    sensor = options.sensors.photos
+    planned = photographer.plan_photos(stage, options.photos, sensor=sensor, rng=generator(seed, 5))
+    write_camera(folder / "photos" / photographer.CAMERA_FILE, photographer.camera(options.photos, sensor))
     entries = [PhotoEntry(p.file, photographer.CAMERA_FILE, p.tag.visit) for p in planned]
     write_photos(folder / "photos" / "photos.toml", entries)
-    for photo, data in photographer.photos(stage.scene, planned, options, rng=generator(seed, 6)):
+    taken = photographer.photos(stage.scene, planned, options.photos, sensor=sensor, rng=generator(seed, 6))
+    for photo, data in taken:
         _write(folder / "photos" / photo.file, data)
     write_tum(folder / "truth" / "photo_poses.txt", [(p.file, p.world_from_cam) for p in planned])
 

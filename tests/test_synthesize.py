@@ -247,7 +247,9 @@ def test_no_camera_stands_inside_or_behind_anything(stage: staging.Stage) -> Non
         assert staging.clear_around(stage.scene, camera, radius_m=0.05)
         assert stage.scene.intersect(shoulder, camera - shoulder)[0] > np.linalg.norm(camera - shoulder)
     for photo in photographer.plan_photos(stage, TINY.photos, rng=generator(SEED, 5)):
-        assert staging.sees(stage.scene, photo.world_from_cam, photographer.PHOTO_CAMERA, photo.tag, margin_px=20.0)
+        assert staging.sees(
+            stage.scene, photo.world_from_cam, photographer.camera(TINY.photos), photo.tag, margin_px=5.0
+        )
 
 
 def test_the_robot_never_drives_into_anything(stage: staging.Stage) -> None:

@@ -17,7 +17,7 @@ from fieldkit.store import Rig, RigCamera
 from sim_bridge.aim import UPRIGHT_FROM_CAM, turn
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.sensors import effects
+from sim_bridge.sensors import ColourSensor, DepthSensor, Motion, bent, effects, encode, expose, sense_depth
 
 Array = NDArray[np.float64]
 
@@ -28,6 +28,8 @@ DEPTH = Camera("PINHOLE", 320, 288, (208.5, 208.5, 160.0, 144.0))
 BASELINE_M = 0.0995
 OUTWARDS_DEG = 52.0
 LOOP_STEP_M = 0.05
+# What 16 bits of millimetres can hold.
+DEPTH_FAR_M = 65.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,26 +43,33 @@ class WalkOptions:
     laps: float = 1.04
     height_m: float = 1.65
     look_around_deg: float = 15.0
-    noise_sigma: float = 1.5
-    jpeg_quality: int = 95
+    speed_m_s: float = 0.6
+    turning_deg_s: float = 12.0
     drift_m: float = 0.005
     drift_yaw_deg: float = 0.1
     tilt_deg: float = 0.1
-    depth_far_m: float = 6.0
-    depth_noise: float = 0.002
 
 
 @dataclasses.dataclass(frozen=True)
 class Station:
-    """One place of the walk: its frame name, the true pose of the rig, and the pose that its SLAM believes."""
+    """One place of the walk: its frame name, the true pose of the rig, and the pose that its SLAM believes.
+
+    ``angular_rad_s`` and ``linear_m_s`` (3,) are how the rig moves, in its own frame.
+    """
 
     frame: str
     world_from_rig: Pose
     slam_from_rig: Pose
+    angular_rad_s: Array
+    linear_m_s: Array
 
 
-def hololens_rig() -> Rig:
-    """Return the rig: LF and RF look forward, LL and RR are turned outwards; the rig frame has x forward, z up."""
+def hololens_rig(sensor: ColourSensor | None = None) -> Rig:
+    """Return the rig: LF and RF look forward, LL and RR are turned outwards; the rig frame has x forward, z up.
+
+    The grey cameras have the lens of ``sensor``, by default none.
+    """
+    vlc = bent(VLC, sensor or ColourSensor())
     side = 0.5 * BASELINE_M
     places = {
         "ll": ((-0.005, side + 0.02, 0.0), OUTWARDS_DEG),
@@ -68,7 +77,7 @@ def hololens_rig() -> Rig:
         "rf": ((0.0, -side, 0.0), 0.0),
         "rr": ((-0.005, -side - 0.02, 0.0), -OUTWARDS_DEG),
     }
-    cameras = tuple(RigCamera(name, VLC, _mounted(at, yaw)) for name, (at, yaw) in places.items())
+    cameras = tuple(RigCamera(name, vlc, _mounted(at, yaw)) for name, (at, yaw) in places.items())
     return Rig(cameras, RigCamera("depth", DEPTH, _mounted((0.01, 0.0, 0.03), 0.0, pitch_deg=-8.0)))
 
 
@@ -96,7 +105,14 @@ def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tup
         for i, k in enumerate(at)
     )
     believed = drifting(poses, options, rng=rng)
-    return tuple(Station(f"{i:06d}", true, slam) for i, (true, slam) in enumerate(zip(poses, believed, strict=True)))
+    turning = np.radians(options.turning_deg_s) * rng.standard_normal((count, 3)) * (0.3, 0.7, 1.0)
+    walking = [
+        pose.rotation.inv().apply(turn(tangent[k]).apply([options.speed_m_s, 0.0, 0.0]))
+        for pose, k in zip(poses, at, strict=True)
+    ]
+    return tuple(
+        Station(f"{i:06d}", *parts) for i, parts in enumerate(zip(poses, believed, turning, walking, strict=True))
+    )
 
 
 def _places(length: int, heading: Array, options: WalkOptions) -> tuple[NDArray[np.intp], Array]:
@@ -161,27 +177,40 @@ def drifting(poses: tuple[Pose, ...], options: WalkOptions, *, rng: np.random.Ge
 
 
 def images(
-    scene: Scene, stations: tuple[Station, ...], options: WalkOptions, *, rng: np.random.Generator
+    scene: Scene, stations: tuple[Station, ...], sensor: ColourSensor, *, rng: np.random.Generator
 ) -> Iterator[tuple[str, Pose, bytes]]:
     """Render every image of the walk: yield its name (``lf/000012.jpg``), world_from_cam, and the JPEG file."""
-    rig = hololens_rig()
+    rig = hololens_rig(sensor)
     for station in stations:
         for mounted in rig.cameras:
             world_from_cam = station.world_from_rig * mounted.rig_from_cam
-            shot = effects.grey(render(scene, mounted.camera, world_from_cam).rgb)
-            noisy = effects.add_noise(shot, sigma=options.noise_sigma, rng=rng)
-            data = effects.jpeg(noisy, quality=options.jpeg_quality)
-            yield f"{mounted.name}/{station.frame}.jpg", world_from_cam, data
+            rendered = render(scene, mounted.camera, world_from_cam)
+            shot = expose(
+                effects.grey(rendered.rgb),
+                sensor,
+                camera=mounted.camera,
+                motion=_motion(station, mounted),
+                depth_m=rendered.depth_m,
+                rng=rng,
+            )
+            yield f"{mounted.name}/{station.frame}.jpg", world_from_cam, encode(shot, sensor)
 
 
 def depths(
-    scene: Scene, stations: tuple[Station, ...], options: WalkOptions, *, rng: np.random.Generator
+    scene: Scene, stations: tuple[Station, ...], sensor: DepthSensor, *, rng: np.random.Generator
 ) -> Iterator[tuple[str, bytes]]:
     """Render every depth image of the walk: yield its name (``000012.png``) and the PNG file."""
-    rig = hololens_rig()
-    assert rig.depth is not None
+    mounted = hololens_rig().depth
+    assert mounted is not None
     for station in stations:
-        world_from_cam = station.world_from_rig * rig.depth.rig_from_cam
-        exact = render(scene, rig.depth.camera, world_from_cam).depth_m
-        noise = rng.standard_normal(exact.shape, dtype=np.float32) * np.float32(options.depth_noise)
-        yield f"{station.frame}.png", effects.depth_png(exact * (1.0 + noise), far_m=options.depth_far_m)
+        exact = render(scene, mounted.camera, station.world_from_rig * mounted.rig_from_cam).depth_m
+        measured = sense_depth(exact, sensor, camera=mounted.camera, rng=rng)
+        yield f"{station.frame}.png", effects.depth_png(measured, far_m=DEPTH_FAR_M)
+
+
+def _motion(station: Station, mounted: RigCamera) -> Motion:
+    """Return how a camera of the rig moves: with the rig, and around its origin."""
+    lever = mounted.rig_from_cam.translation
+    linear = station.linear_m_s + np.cross(station.angular_rad_s, lever)
+    cam_from_rig = mounted.rig_from_cam.rotation.inv()
+    return Motion(cam_from_rig.apply(station.angular_rad_s), cam_from_rig.apply(linear))

@@ -15,13 +15,14 @@ from sim_bridge.aim import look_at
 from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.sensors import effects
+from sim_bridge.sensors import ColourSensor, Motion, bent, encode, expose
+from sim_bridge.sensors.models import DSLR
 from sim_bridge.stage.staging import PlacedTag, Stage, clear_around, richness, sees, slant
 
 Array = NDArray[np.float64]
 
-# 12 megapixels, 69 deg wide, with the barrel distortion of an ordinary zoom lens.
-PHOTO_CAMERA = Camera("OPENCV", 4000, 3000, (2905.4, 2903.1, 2012.3, 1489.6, -0.105, 0.062, 0.0007, -0.0005))
+# 12 megapixels, 69 deg wide; the distortion is that of the sensor's lens.
+PHOTO_CAMERA = Camera("PINHOLE", 4000, 3000, (2905.4, 2903.1, 2012.3, 1489.6))
 CAMERA_FILE = "camera.toml"
 # Viewpoints that are proposed in each sector before a tag.
 TRIES = 16
@@ -36,8 +37,7 @@ class PhotoOptions:
     distance_m: tuple[float, float] = (0.8, 2.2)
     height_m: tuple[float, float] = (1.1, 1.7)
     slant_deg: float = 50.0
-    noise_sigma: float = 1.5
-    jpeg_quality: int = 92
+    shake_deg_s: float = 1.0
     scale: float = 1.0
 
 
@@ -50,40 +50,49 @@ class Photo:
     world_from_cam: Pose
 
 
-def camera(options: PhotoOptions) -> Camera:
+def camera(options: PhotoOptions, sensor: ColourSensor = DSLR) -> Camera:
     """Return the calibrated camera of the photos."""
-    return PHOTO_CAMERA if options.scale == 1.0 else PHOTO_CAMERA.scaled(options.scale)
+    return bent(PHOTO_CAMERA if options.scale == 1.0 else PHOTO_CAMERA.scaled(options.scale), sensor)
 
 
-def plan_photos(stage: Stage, options: PhotoOptions, *, rng: np.random.Generator) -> tuple[Photo, ...]:
+def plan_photos(
+    stage: Stage, options: PhotoOptions, *, rng: np.random.Generator, sensor: ColourSensor = DSLR
+) -> tuple[Photo, ...]:
     """Choose the viewpoints of all photos; raises SynthesisError where too few places see a tag."""
-    photos = []
+    photos, taken = [], camera(options, sensor)
     for tag in stage.tags:
         name = f"start{tag.id}" if tag.visit is None else tag.visit
         count = options.start_photos if tag.visit is None else options.tripod_photos
-        poses = _viewpoints(stage.scene, tag, count, options, rng=rng)
+        poses = _viewpoints(stage.scene, tag, count, options, taken=taken, rng=rng)
         photos += [Photo(f"{name}_{k + 1:02d}.jpg", tag, pose) for k, pose in enumerate(poses)]
     return tuple(photos)
 
 
 def photos(
-    scene: Scene, planned: tuple[Photo, ...], options: PhotoOptions, *, rng: np.random.Generator
+    scene: Scene,
+    planned: tuple[Photo, ...],
+    options: PhotoOptions,
+    *,
+    rng: np.random.Generator,
+    sensor: ColourSensor = DSLR,
 ) -> Iterator[tuple[Photo, bytes]]:
-    """Render the photos: yield each with its JPEG file."""
+    """Render the photos: yield each with its JPEG file. Hands shake a little."""
+    taken = camera(options, sensor)
     for photo in planned:
-        image = render(scene, camera(options), photo.world_from_cam).rgb
-        noisy = effects.add_noise(image, sigma=options.noise_sigma, rng=rng)
-        yield photo, effects.jpeg(noisy, quality=options.jpeg_quality)
+        shake = np.radians(options.shake_deg_s) * rng.standard_normal(3)
+        image = render(scene, taken, photo.world_from_cam).rgb
+        shot = expose(image, sensor, camera=taken, motion=Motion(shake, np.zeros(3)), rng=rng)
+        yield photo, encode(shot, sensor)
 
 
 def _viewpoints(
-    scene: Scene, tag: PlacedTag, count: int, options: PhotoOptions, *, rng: np.random.Generator
+    scene: Scene, tag: PlacedTag, count: int, options: PhotoOptions, *, taken: Camera, rng: np.random.Generator
 ) -> list[Pose]:
     """Choose viewpoints from left to right of a tag; in each sector the one that shows most of the surroundings."""
     edges = np.linspace(-options.slant_deg, options.slant_deg, count + 1)
     sectors: list[list[tuple[int, Pose]]] = []
     for sector in itertools.pairwise(edges):
-        found = [_try(scene, tag, sector, options, rng=rng) for _ in range(TRIES)]
+        found = [_try(scene, tag, sector, options, taken=taken, rng=rng) for _ in range(TRIES)]
         shown = [(richness(scene, pose), pose) for pose in found if pose is not None]
         sectors.append(sorted(shown, key=lambda item: -item[0]))
     # A sector that furniture blocks, or that shows a bare wall, leaves its photo to the others.
@@ -100,7 +109,13 @@ def _viewpoints(
 
 
 def _try(
-    scene: Scene, tag: PlacedTag, sector_deg: tuple[float, float], options: PhotoOptions, *, rng: np.random.Generator
+    scene: Scene,
+    tag: PlacedTag,
+    sector_deg: tuple[float, float],
+    options: PhotoOptions,
+    *,
+    taken: Camera,
+    rng: np.random.Generator,
 ) -> Pose | None:
     """Propose a viewpoint in a sector, the tag somewhere in the picture; None when it does not work."""
     angle, distance = np.radians(rng.uniform(*sector_deg)), rng.uniform(*options.distance_m)
@@ -117,7 +132,6 @@ def _try(
         return None
     across = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     pose = look_at(at, tag.world_from_tag.translation + aside * across + [0.0, 0.0, up], roll_rad=float(roll))
-    taken = camera(options)
     margin = 0.06 * taken.height
     if slant(pose, tag) > np.radians(options.slant_deg + 8.0) or not sees(scene, pose, taken, tag, margin_px=margin):
         return None

@@ -46,14 +46,14 @@ class Exposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     to steps of ``step_ev``. Lamps and windows, white in a rendering, are ``highlights`` times as bright as paper.
     """
 
-    target: Share = 0.45
-    white_s: Positive = 0.02
+    target: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.45
+    white_s: Positive = 0.04
     shortest_s: Positive = 0.0002
     longest_s: Positive = 0.02
     most_gain: Annotated[float, Meta(ge=1.0)] = 16.0
     error_ev: NotNegative = 0.1
     step_ev: NotNegative = 0.125
-    highlights: Annotated[float, Meta(ge=1.0)] = 4.0
+    highlights: Annotated[float, Meta(ge=1.0)] = 3.0
 
 
 class Vignetting(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -133,25 +133,30 @@ class Sensors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     photos: ColourSensor = ColourSensor()
 
 
-# Spot's hand camera, a phone-sized module; its driver gives rectified images.
+# Spot's hand camera, a small module; its driver gives rectified images.
 HAND_COLOR = ColourSensor(
-    exposure=Exposure(), vignetting=Vignetting(), noise=Noise(), blur=Blur(), jpeg=Jpeg(quality=90)
+    exposure=Exposure(white_s=0.04, longest_s=0.02, most_gain=16.0),
+    vignetting=Vignetting(strength=0.7),
+    noise=Noise(full_well_e=8000.0, read_e=5.0),
+    blur=Blur(),
+    jpeg=Jpeg(quality=90),
 )
 HAND_DEPTH = DepthSensor(depth_noise=DepthNoise(), depth_holes=DepthHoles())
-# HoloLens 2: global-shutter tracking cameras that see in dim rooms, and the long-throw depth camera.
+# HoloLens 2: tracking cameras with global shutters that see in dim rooms, and the long-throw depth camera.
 VLC = ColourSensor(
-    exposure=Exposure(longest_s=0.01, white_s=0.008, most_gain=12.0),
+    exposure=Exposure(white_s=0.015, longest_s=0.008, most_gain=16.0),
     vignetting=Vignetting(strength=0.8),
-    noise=Noise(full_well_e=10000.0, read_e=5.0),
+    noise=Noise(full_well_e=8000.0, read_e=5.0),
     blur=Blur(exposure_s=0.005),
     jpeg=Jpeg(quality=95),
 )
 LONG_THROW = DepthSensor(
     depth_noise=DepthNoise(floor_m=0.002, per_m2=0.0005), depth_holes=DepthHoles(near_m=0.3, edge_share=0.6)
 )
-# A camera with a large sensor, held with care.
+# A camera with a large sensor, stopped down and held with care; the barrel distortion of an ordinary zoom lens.
 DSLR = ColourSensor(
-    exposure=Exposure(white_s=0.03, longest_s=0.0125, most_gain=32.0, error_ev=0.15, step_ev=1 / 3),
+    lens=Lens(kind="radtan", coefficients=(-0.105, 0.062, 0.0007, -0.0005)),
+    exposure=Exposure(white_s=0.1, longest_s=0.0125, most_gain=32.0, error_ev=0.15, step_ev=0.33),
     vignetting=Vignetting(strength=0.5),
     noise=Noise(full_well_e=60000.0, read_e=4.0),
     blur=Blur(),
