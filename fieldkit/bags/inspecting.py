@@ -27,8 +27,8 @@ from fieldkit.types import Frame, Visit
 def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -> dict[str, Any]:
     """Return what a recording holds and lacks as a dict for JSON; times in ns and s.
 
-    Keys: version, path, name, format, duration_s, n_messages, layout (None when none fits), topics, images, odometry,
-    reference, starts, visits, warnings, missing. Raises BagError only for a file that cannot be opened or is damaged.
+    Keys: version, path, name, format, duration_s, n_messages, layout (None when none fits), topics, images, depth,
+    odometry, joint_states, reference, starts, visits, warnings, missing. Raises BagError only for a file that cannot be opened or is damaged.
     """
     source = open_source(path)
     bag = source.bag
@@ -67,7 +67,12 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
         "layout": None if found is None else found.name,
         "topics": [{"name": n, "type": t.type, "count": t.count} for n, t in sorted(bag.topics.items())],
         "images": _images(content, frames, n_unreached=len(unreached)),
+        "depth": _depth(bag, used),
         "odometry": {"count": len(odometry), "parent": odometry.parent, "child": odometry.child},
+        "joint_states": {
+            "count": len(content.joints),
+            "names": sorted({name for _, angles in content.joints for name in angles}),
+        },
         "reference": {"count": len(content.reference.samples)},
         "starts": [dataclasses.asdict(start) for start in marks.starts],
         "visits": _visit_rows(marks, visits),
@@ -109,6 +114,13 @@ def _images(content: Content, frames: tuple[Frame, ...], *, n_unreached: int) ->
         "without_tf": n_unreached,
         "cameras": dict(sizes),
     }
+
+
+def _depth(bag: BagFile, layout: Layout) -> dict[str, Any]:
+    counts = {t: bag.topics[t].count if t in bag.topics else 0 for t in (layout.depth, layout.depth_compressed)}
+    topic = max(counts, key=lambda t: counts[t])
+    info = bag.topics[layout.depth_info].count if layout.depth_info in bag.topics else 0
+    return {"topic": topic if counts[topic] else None, "count": counts[topic], "camera_info": info}
 
 
 def _visit_rows(marks: Marks, visits: tuple[Visit, ...]) -> list[dict[str, Any]]:

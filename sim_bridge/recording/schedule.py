@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from fieldkit.frames import Pose
 from fieldkit.types import ViewKind
@@ -17,6 +18,7 @@ from sim_bridge.stage.staging import Stage, StageOptions, Waypoint, clear_around
 Array = NDArray[np.float64]
 
 LOOKAHEAD_M = 1.5
+_LAG_STEP_S = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +26,9 @@ class ScheduleOptions:
     """What is looked at, and how fast things move.
 
     ``starts`` "each": every waypoint is reached from the start tag, as in the paper; "once": the robot sees the start
-    tag at the beginning and then goes from waypoint to waypoint.
+    tag at the beginning and then goes from waypoint to waypoint. The arm follows its commands with a lag (the time in
+    which what is left shrinks to a third), so a little speed remains after ``settle_s``; and it never stands quite
+    still: every joint sways slowly by ``sway_deg`` and trembles by ``tremor_deg``.
     """
 
     starts: Literal["each", "once"] = "each"
@@ -36,7 +40,9 @@ class ScheduleOptions:
     turn_rad_s: float = 0.9
     arm_rad_s: float = 1.4
     settle_s: float = 0.35
+    lag_s: float = 0.06
     sway_deg: float = 0.12
+    tremor_deg: float = 0.008
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +57,10 @@ class Shot:
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """The motion of body (x, y, yaw) and arm (four joints) over time, the images, and the events."""
+    """The motion of body (x, y, yaw) and arm (six joints) over time, the images, and the events.
+
+    ``sway`` f64[2,3,6] is what the arm moves by itself: amplitude, rate (rad/s) and phase of two waves per joint.
+    """
 
     body: Track
     arm: Track
@@ -66,9 +75,9 @@ class Schedule:
         return robot.standing([x, y], yaw)
 
     def joints(self, t_s: float) -> robot.ArmJoints:
-        """Return the true joints at a time: where the arm was sent, and the little it sways."""
-        amplitude, rate, phase = self.sway
-        return robot.joints(self.arm.at(t_s)[0] + amplitude * np.sin(rate * t_s + phase))
+        """Return the true joints at a time: where the arm has come, and the little it sways."""
+        amplitude, rate, phase = np.moveaxis(self.sway, 1, 0)
+        return robot.joints(self.arm.at(t_s)[0] + (amplitude * np.sin(rate * t_s + phase)).sum(axis=0))
 
 
 def plan_session(
@@ -86,14 +95,26 @@ def plan_session(
         planner.look_around(index)
         planner.leave(index)
     planner.wait(0.5)
-    sway = np.stack(
-        [
-            np.radians(options.sway_deg) * rng.uniform(0.5, 1.0, 4),
-            2 * np.pi * rng.uniform(0.4, 0.9, 4),
-            rng.uniform(0.0, 2 * np.pi, 4),
-        ]
-    )
-    return planner.schedule(sway)
+    waves = ((options.sway_deg, (0.4, 0.9)), (options.tremor_deg, (5.0, 9.0)))
+    return planner.schedule(np.stack([_wave(*wave, rng=rng) for wave in waves]))
+
+
+def _wave(degrees: float, hertz: tuple[float, float], *, rng: np.random.Generator) -> Array:
+    """Return amplitudes, rates and phases (3, 6) of a wave in every joint."""
+    count = len(robot.JOINTS)
+    amplitude = np.radians(degrees) * rng.uniform(0.5, 1.0, count)
+    return np.stack([amplitude, 2 * np.pi * rng.uniform(*hertz, count), rng.uniform(0.0, 2 * np.pi, count)])
+
+
+def lagging(track: Track, lag_s: float, *, end_s: float) -> Track:
+    """Return a track that follows another one with a lag: a first-order low pass, sampled a hundred times a second."""
+    times = np.arange(int(np.ceil(end_s / _LAG_STEP_S)) + 1) * _LAG_STEP_S
+    wanted = track.at(times)
+    if lag_s <= 0.0:
+        return Track(times, wanted)
+    keep = float(np.exp(-_LAG_STEP_S / lag_s))
+    values, _ = lfilter([1.0 - keep], [1.0, -keep], wanted, axis=0, zi=keep * wanted[:1])
+    return Track(times, values)
 
 
 class _Planner:
@@ -120,14 +141,15 @@ class _Planner:
     def schedule(self, sway: Array) -> Schedule:
         """Return what was planned."""
         self.wait(0.0)
-        return Schedule(self._body.build(), self._arm.build(), tuple(self._shots), tuple(self._events), self._now, sway)
+        arm = lagging(self._arm.build(), self._options.lag_s, end_s=self._now)
+        return Schedule(self._body.build(), arm, tuple(self._shots), tuple(self._events), self._now, sway)
 
     def look_at_start_tag(self, visit: str | None) -> None:
         """Stand before the start tag while the arm moves slowly around the direction to it; for one visit or all."""
         tag, count = self._stage.start_tag, self._options.start_images
         named = {} if visit is None else {"visit": visit}
         centre = looking_at(self._stage.world_from_start, tag.world_from_tag.translation).as_array()
-        swing = np.radians([6.0, 0.0, 0.0, 3.0]) * self._rng.uniform(0.7, 1.0) * self._rng.choice([-1.0, 1.0])
+        swing = np.radians([6.0, 0.0, 0.0, 0.0, 3.0, 0.0]) * self._rng.uniform(0.7, 1.0) * self._rng.choice([-1.0, 1.0])
         self._reach(centre - swing)
         self.wait(self._options.settle_s)
         self._event("start_begin", tag_id=tag.id, **named)
@@ -213,7 +235,10 @@ class _Planner:
         self._arm.hold_until(self._now)
 
     def _forward_yaw(self, index: int) -> float:
-        """Return the body's yaw towards the path to the next waypoint; at the last one, the way the robot arrived."""
+        """Return the arm's yaw towards the path to the next waypoint; at the last one, the way the robot arrived.
+
+        Behind the robot, where sh0 does not reach, it is the nearest that it reaches.
+        """
         here = self._stage.waypoints[index].world_from_body
         if index + 1 < len(self._stage.waypoints):
             goal = self._stage.waypoints[index + 1].world_from_body.translation[:2]
@@ -224,19 +249,20 @@ class _Planner:
         else:
             before = self._stage.waypoints[index - 1].world_from_body if index else self._stage.world_from_start
             step = here.translation[:2] - before.translation[:2]
-        yaw = float(np.arctan2(step[1], step[0])) - _flat(here)[2]
-        return float((yaw + np.pi) % (2 * np.pi) - np.pi)
+        wanted = robot.looking(float(np.arctan2(step[1], step[0])) - _flat(here)[2], 0.0).sh0
+        return float(np.clip(wanted, *robot.LIMITS_RAD[0]))
 
     def _event(self, event: str, **values: Any) -> None:
         self._events.append((self._now, {"event": event, **values}))
 
 
 def sweep_arms(options: ScheduleOptions) -> list[robot.ArmJoints]:
-    """Return the arm poses of the sweep: all around at every pitch, back and forth, rows staggered by half a step."""
+    """Return the arm poses of the sweep: all that sh0 reaches at every pitch, rows staggered, back and forth."""
+    low, high = robot.LIMITS_RAD[0]
+    step = min(2 * np.pi / options.sweep_yaws, (high - low) / (options.sweep_yaws - 0.5))
     arms = []
-    step = 2 * np.pi / options.sweep_yaws
     for row, pitch in enumerate(options.sweep_pitches_deg):
-        yaws = -np.pi + step * (np.arange(options.sweep_yaws) + (0.25 if row % 2 == 0 else 0.75))
+        yaws = low + step * (np.arange(options.sweep_yaws) + 0.5 * (row % 2))
         arms += [robot.looking(float(yaw), np.radians(pitch)) for yaw in (yaws if row % 2 == 0 else yaws[::-1])]
     return arms
 

@@ -269,7 +269,7 @@ def _place_waypoint(stage: Stage, options: StageOptions, *, index: int, rng: np.
 
 
 def _sweep_is_clear(scene: Scene, body: Pose) -> bool:
-    arms = [robot.looking(float(yaw), 0.0) for yaw in np.linspace(-np.pi, np.pi, 12, endpoint=False)]
+    arms = [robot.looking(float(yaw), 0.0) for yaw in np.linspace(*robot.LIMITS_RAD[0], 12)]
     views = [body * robot.body_from_camera(arm) for arm in (robot.STOWED, *arms)]
     return all(clear_around(scene, view.translation, radius_m=0.12) for view in views)
 
@@ -331,13 +331,14 @@ def _truth_arms(
     """Return arm poses, far from each other, that see a tag near and at a slant; fewer than asked where few do."""
     found, centres = [], []
     for trial in range(150):
-        lift = robot.RAISED_SH1 + rng.uniform(-0.7, 0.4)
-        direct = looking_at(body, tag.world_from_tag.translation, sh1=lift, el0=-lift + rng.uniform(-0.3, 0.4))
-        arm = robot.joints(direct.as_array() + [rng.uniform(-0.25, 0.25), 0.0, 0.0, rng.uniform(-0.2, 0.2)])
+        sh1 = robot.RAISED_SH1 + rng.uniform(-0.4, 0.7)
+        direct = looking_at(body, tag.world_from_tag.translation, sh1=sh1, el0=-sh1 + rng.uniform(-0.4, 0.3))
+        turned = [rng.uniform(-0.25, 0.25), 0.0, 0.0, 0.0, rng.uniform(-0.2, 0.2), 0.0]
+        arm = robot.joints(direct.as_array() + turned)
         view = body * robot.body_from_camera(arm)
         distance = float(np.linalg.norm(view.translation - tag.world_from_tag.translation))
         low, high = np.radians(options.truth_slant_deg)
-        near = options.truth_distance_m[0] <= distance <= options.truth_distance_m[1]
+        near = options.truth_distance_m[0] <= distance <= options.truth_distance_m[1] and robot.within_limits(arm)
         good = near and low <= slant(view, tag) <= high and clear_around(scene, view.translation, radius_m=0.1)
         if good and sees(scene, view, robot.ARM_CAMERA, tag, margin_px=25.0):
             found.append(arm)
