@@ -30,17 +30,32 @@ def lit(blueprint: Blueprint, light: Light | None = None, *, rng: np.random.Gene
     """Return the scene of a blueprint under a light."""
     chosen = light or Light()
     grids = [_grid(quad) for quad in blueprint.quads]
-    offsets = np.cumsum([0] + [len(g.points) for g in grids])
-    points = np.concatenate([g.points for g in grids])
+    scene = _meshed(blueprint, grids)
     per_quad = [len(g.points) for g in grids]
     normals = np.repeat([q.normal for q in blueprint.quads], per_quad, axis=0)
     pairs = list(zip(blueprint.quads, grids, strict=True))
     inward = np.concatenate([q.corners.mean(axis=0) - g.points for q, g in pairs])
+    solid = np.repeat([q.solid for q in blueprint.quads], [len(g.faces) for g in grids])
+    origins = scene.vertices + 2e-3 * normals + 0.01 * inward
+    blockers = dataclasses.replace(scene, faces=scene.faces[solid])
+    brightness = bake(blockers, origins, normals, blueprint.lamps, chosen, rng=rng)
+    glow = np.repeat([np.nan if q.glow is None else q.glow for q in blueprint.quads], per_quad)
+    brightness = np.where(np.isnan(glow), brightness, glow)
+    return dataclasses.replace(scene, shade=brightness[scene.faces].astype(np.float32))
+
+
+def unlit(blueprint: Blueprint) -> Scene:
+    """Return the scene of a blueprint with its textures as they are: its shape, quickly."""
+    return _meshed(blueprint, [_grid(quad) for quad in blueprint.quads])
+
+
+def _meshed(blueprint: Blueprint, grids: list[_Grid]) -> Scene:
+    offsets = np.cumsum([0] + [len(g.points) for g in grids])
     faces = np.concatenate([g.faces + start for g, start in zip(grids, offsets[:-1], strict=True)])
     uv = np.concatenate([g.uv for g in grids])
     counts = [len(g.faces) for g in grids]
-    scene = Scene(
-        vertices=points,
+    return Scene(
+        vertices=np.concatenate([g.points for g in grids]),
         faces=faces.astype(np.int32),
         uv=uv[faces].astype(np.float32),
         texture=np.repeat([q.texture for q in blueprint.quads], counts).astype(np.int32),
@@ -51,13 +66,6 @@ def lit(blueprint: Blueprint, light: Light | None = None, *, rng: np.random.Gene
         walk_xy=blueprint.walk_xy,
         floor_bounds=blueprint.floor_bounds,
     )
-    solid = np.repeat([q.solid for q in blueprint.quads], counts)
-    origins = points + 2e-3 * normals + 0.01 * inward
-    blockers = dataclasses.replace(scene, faces=scene.faces[solid])
-    brightness = bake(blockers, origins, normals, blueprint.lamps, chosen, rng=rng)
-    glow = np.repeat([np.nan if q.glow is None else q.glow for q in blueprint.quads], per_quad)
-    brightness = np.where(np.isnan(glow), brightness, glow)
-    return dataclasses.replace(scene, shade=brightness[scene.faces].astype(np.float32))
 
 
 @dataclasses.dataclass(frozen=True)
