@@ -23,7 +23,8 @@ def synthesize(
     out: Path,
     scene: str = "room",
     seed: int = 0,
-    format: tuple[BagFormat, ...] = ("mcap",),
+    format: tuple[BagFormat, ...] | None = None,
+    layout: str = "generic",
     waypoints: int = 4,
     starts: Literal["each", "once"] = "each",
     stations: int = 54,
@@ -36,7 +37,9 @@ def synthesize(
         out: session folder to write
         scene: name of a scene
         seed: the same seed gives the same bytes
-        format: one or more formats of the recording; all hold the same images
+        format: one or more formats of the recording; all hold the same images; by default the layout's own: ros1 for
+            spot_ros1, else mcap
+        layout: names of topics and frames: generic, or those of a driver, spot_ros1 or spot_ros2
         waypoints: number of waypoints, each with a tripod tag
         starts: each waypoint reached from the start tag, as in the paper, or once for the whole session
         stations: number of places at which the mapping rig takes its images
@@ -44,6 +47,8 @@ def synthesize(
         force: replace an existing folder
     """
     from sim_bridge.errors import SynthesisError
+    from sim_bridge.recording.recorder import own_format
+    from sim_bridge.sensors import with_quality
     from sim_bridge.synthesize import SessionOptions
     from sim_bridge.synthesize import synthesize as write_session
 
@@ -57,10 +62,11 @@ def synthesize(
         walk=dataclasses.replace(standard.walk, stations=stations),
         stage=dataclasses.replace(standard.stage, waypoints=waypoints),
         schedule=dataclasses.replace(standard.schedule, starts=starts),
-        recorder=dataclasses.replace(standard.recorder, jpeg_quality=quality),
+        recorder=dataclasses.replace(standard.recorder, layout=layout),
+        sensors=with_quality(standard.sensors, quality),
     )
     begin = time.monotonic()
-    write_session(scene, out, seed=seed, formats=format, options=options, force=force)
+    write_session(scene, out, seed=seed, formats=format or (own_format(layout),), options=options, force=force)
     logging.getLogger(__name__).info("%s written in %.0f s", out, time.monotonic() - begin)
 
 

@@ -56,13 +56,15 @@ def synthesize(
 ) -> None:
     """Write a session folder; the same scene, seed and options give the same bytes.
 
-    The recordings of all formats hold the same images, bit for bit. Raises SynthesisError for an unknown scene or
-    format, or a scene without room for the session, and StoreError when the folder exists and ``force`` is not set.
+    The recordings of all formats hold the same images, bit for bit. Raises SynthesisError for an unknown scene,
+    format or layout, or a scene without room for the session, and StoreError when the folder exists and ``force`` is
+    not set.
     """
     chosen, out = options or SessionOptions(), Path(out)
     for wanted in formats or ("none",):
         if wanted not in recorder.RECORDINGS:
             raise SynthesisError(f"unknown format {wanted!r}", hint=suggestion(wanted, list(recorder.RECORDINGS)))
+    recorder.check_layout(chosen.recorder.layout)
     if seed < 0:
         raise SynthesisError(f"seed {seed}; expected 0 or more", hint="choose another seed")
     refuse_existing(out, force=force, marker="session.toml", kind="folder")
@@ -76,7 +78,8 @@ def synthesize(
         _write_surface(folder / "truth" / "surface.ply", room)
         _write_tags(folder / "truth" / "tags.toml", stage)
         recording = recorder.RECORDINGS[formats[0]]
-        write_session(folder / "session.toml", SessionFile(f"{scene}-{seed}", recording, layout="generic"))
+        layout = chosen.recorder.layout
+        write_session(folder / "session.toml", SessionFile(f"{scene}-{seed}", recording, layout=layout))
 
 
 def generator(seed: int, part: int) -> np.random.Generator:
@@ -114,9 +117,10 @@ def _write_robot(
     folder: Path, stage: staging.Stage, options: SessionOptions, formats: Sequence[BagFormat], *, seed: int
 ) -> None:
     plan = schedule.plan_session(stage, options.schedule, stage_options=options.stage, rng=generator(seed, 7))
-    sensed = recorder.sense(stage, plan, options.recorder, rng=generator(seed, 8))
+    sensed = recorder.sense(stage, plan, options.recorder, sensors=options.sensors, rng=generator(seed, 8))
     for name in dict.fromkeys(formats):
-        recorder.write_recording(folder / recorder.RECORDINGS[name], sensed, format=name)
+        path = folder / recorder.RECORDINGS[name]
+        recorder.write_recording(path, sensed, format=name, layout=options.recorder.layout)
     truth = folder / "truth"
     write_tum(truth / "body_poses.txt", [(str(t_ns), pose) for t_ns, pose in sensed.world_from_body])
     write_tum(truth / "view_poses.txt", [(str(image.t_ns), image.world_from_cam) for image in sensed.images])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.bags import LAYOUTS, Layout, RecordingWriter
+from fieldkit.bags import LAYOUTS, RecordingWriter
 from fieldkit.bags.writing import BagFormat
 from fieldkit.cameras import Camera
 from fieldkit.errors import suggestion
@@ -36,11 +36,12 @@ _INSTANT_S = 0.004
 
 @dataclasses.dataclass(frozen=True)
 class RecorderOptions:
-    """Rates and errors: the robot's state comes ``state_hz`` times a second (None: as the layout's driver does).
+    """Names, rates and errors: the robot's state comes ``state_hz`` times a second (None: as the layout's driver does).
 
     The errors of the arm and of odometry are the robot's own; those of its cameras are the session's sensors.
     """
 
+    layout: str = "generic"
     state_hz: float | None = None
     jitter_s: float = 0.004
     kinematics: robot.KinematicOptions = dataclasses.field(default_factory=robot.KinematicOptions)
@@ -83,11 +84,10 @@ def stamp(t_s: float) -> int:
     return BEGIN_NS + round(t_s * 1e9)
 
 
-def check_layout(name: str) -> Layout:
-    """Return the layout of a name; raises SynthesisError for an unknown one."""
+def check_layout(name: str) -> None:
+    """Raise SynthesisError for an unknown layout."""
     if name not in LAYOUTS:
         raise SynthesisError(f"unknown layout {name!r}", hint=suggestion(name, list(LAYOUTS)))
-    return LAYOUTS[name]
 
 
 def own_format(layout: str) -> BagFormat:
@@ -102,7 +102,6 @@ def sense(
     *,
     rng: np.random.Generator,
     sensors: Sensors = STANDARD,
-    layout: str = "generic",
 ) -> Sensed:
     """Play a schedule: render colour and depth, measure joints and odometry.
 
@@ -111,7 +110,7 @@ def sense(
     """
     for_arm, for_states, for_images = rng.spawn(3)
     kinematics = robot.assembled(options.kinematics, rng=for_arm)
-    rate_hz = STATE_HZ[layout] if options.state_hz is None else options.state_hz
+    rate_hz = STATE_HZ[options.layout] if options.state_hz is None else options.state_hz
     states, true_body = _states(schedule, kinematics, options, rate_hz=rate_hz, rng=for_states)
     camera = bent(robot.ARM_CAMERA, sensors.hand)
     images, events = [], [(stamp(t), event) for t, event in schedule.events]

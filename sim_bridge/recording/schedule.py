@@ -108,7 +108,7 @@ def _wave(degrees: float, hertz: tuple[float, float], *, rng: np.random.Generato
 
 def lagging(track: Track, lag_s: float, *, end_s: float) -> Track:
     """Return a track that follows another one with a lag: a first-order low pass, sampled a hundred times a second."""
-    times = np.arange(int(np.ceil(end_s / _LAG_STEP_S)) + 1) * _LAG_STEP_S
+    times: Array = np.arange(int(np.ceil(end_s / _LAG_STEP_S)) + 1, dtype=np.float64) * _LAG_STEP_S
     wanted = track.at(times)
     if lag_s <= 0.0:
         return Track(times, wanted)
@@ -250,7 +250,7 @@ class _Planner:
             before = self._stage.waypoints[index - 1].world_from_body if index else self._stage.world_from_start
             step = here.translation[:2] - before.translation[:2]
         wanted = robot.looking(float(np.arctan2(step[1], step[0])) - _flat(here)[2], 0.0).sh0
-        return float(np.clip(wanted, *robot.LIMITS_RAD[0]))
+        return float(np.clip(wanted, *robot.SH0_RANGE_RAD))
 
     def _event(self, event: str, **values: Any) -> None:
         self._events.append((self._now, {"event": event, **values}))
@@ -258,7 +258,7 @@ class _Planner:
 
 def sweep_arms(options: ScheduleOptions) -> list[robot.ArmJoints]:
     """Return the arm poses of the sweep: all that sh0 reaches at every pitch, rows staggered, back and forth."""
-    low, high = robot.LIMITS_RAD[0]
+    low, high = robot.SH0_RANGE_RAD
     step = min(2 * np.pi / options.sweep_yaws, (high - low) / (options.sweep_yaws - 0.5))
     arms = []
     for row, pitch in enumerate(options.sweep_pitches_deg):

@@ -31,8 +31,9 @@ FOOTPRINT_RADIUS_M = 0.45
 
 JOINTS = ("sh0", "sh1", "el0", "el1", "wr0", "wr1")
 # Lowest and highest angle (rad) of every joint.
+SH0_RANGE_RAD = (-2.61799, 3.14159)
 LIMITS_RAD: Array = np.array(
-    [(-2.61799, 3.14159), (-3.14159, 0.52360), (0.0, 3.14159), (-2.79253, 2.79253), (-1.83260, 1.83260)]
+    [SH0_RANGE_RAD, (-3.14159, 0.52360), (0.0, 3.14159), (-2.79253, 2.79253), (-1.83260, 1.83260)]
     + [(-2.87979, 2.87979)]
 )
 # Where every joint sits in the link before it; the first in the body.
@@ -98,7 +99,7 @@ def looking(yaw_rad: float, pitch_rad: float, *, sh1: float = RAISED_SH1, el0: f
     ``sh1`` and ``el0`` hold the hand; el1 and wr1 are 0. Any yaw is answered, sh0 is the equal angle nearest to its
     range: whoever minds the limits asks `within_limits`.
     """
-    low, high = LIMITS_RAD[0]
+    low, high = SH0_RANGE_RAD
     begin = 0.5 * (low + high) - np.pi
     sh0 = begin + (float(yaw_rad) - begin) % (2.0 * np.pi)
     return ArmJoints(sh0, float(sh1), float(el0), 0.0, float(CAMERA_TILT_RAD - pitch_rad - sh1 - el0), 0.0)

@@ -14,6 +14,7 @@ from sim_bridge.sensors.models import (
     Sensors,
     bent,
     load_sensors,
+    with_quality,
     without,
     write_sensors,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "expose",
     "load_sensors",
     "sense_depth",
+    "with_quality",
     "without",
     "write_sensors",
 ]

@@ -191,6 +191,12 @@ def load_sensors(name: str) -> Sensors:
     return read_toml(Path(name), Sensors, what="sensor settings as in a session's sensors.toml")
 
 
+def with_quality(sensors: Sensors, quality: int) -> Sensors:
+    """Return the sensors with another JPEG quality (1 to 100) of the hand camera."""
+    hand = msgspec.structs.replace(sensors.hand, jpeg=Jpeg(quality=quality))
+    return msgspec.structs.replace(sensors, hand=hand)
+
+
 def write_sensors(path: Path, sensors: Sensors) -> None:
     """Write sensors as TOML; effects that are off are left out."""
     write_toml(path, sensors)

@@ -269,7 +269,7 @@ def _place_waypoint(stage: Stage, options: StageOptions, *, index: int, rng: np.
 
 
 def _sweep_is_clear(scene: Scene, body: Pose) -> bool:
-    arms = [robot.looking(float(yaw), 0.0) for yaw in np.linspace(*robot.LIMITS_RAD[0], 12)]
+    arms = [robot.looking(float(yaw), 0.0) for yaw in np.linspace(*robot.SH0_RANGE_RAD, 12)]
     views = [body * robot.body_from_camera(arm) for arm in (robot.STOWED, *arms)]
     return all(clear_around(scene, view.translation, radius_m=0.12) for view in views)
 
