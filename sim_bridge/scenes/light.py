@@ -35,7 +35,9 @@ def lit(blueprint: Blueprint, light: Light | None = None, *, rng: np.random.Gene
     normals = np.repeat([q.normal for q in blueprint.quads], per_quad, axis=0)
     pairs = list(zip(blueprint.quads, grids, strict=True))
     inward = np.concatenate([q.corners.mean(axis=0) - g.points for q, g in pairs])
-    solid = np.repeat([q.solid for q in blueprint.quads], [len(g.faces) for g in grids])
+    # A flat picture would cast, through the coarse cells of the wall behind it, a halo far too large.
+    casts = [q.solid and blueprint.things[q.thing].kind != "picture" for q in blueprint.quads]
+    solid = np.repeat(casts, [len(g.faces) for g in grids])
     origins = scene.vertices + 2e-3 * normals + 0.01 * inward
     blockers = dataclasses.replace(scene, faces=scene.faces[solid])
     brightness = bake(blockers, origins, normals, blueprint.lamps, chosen, rng=rng)
