@@ -88,8 +88,9 @@ def wall(
 
     ``left`` and ``right`` are the textures of its faces as one walks from start to end. A texture spans the whole
     face (seen from its own side, first row at the ceiling), and a part of the wall shows its part. ``trim`` is the
-    texture of a skirting board. A face that nobody sees may be None. Walls of one thickness may end on each other's line: both ends reach half a
-    thickness (less 1 mm, so that no faces coincide) beyond it. Raises ValueError for openings that do not fit.
+    texture of a skirting board. A face that nobody sees may be None. Walls of one thickness may end on each other's
+    line: both ends reach half a thickness (less 1 mm, so that no faces coincide) beyond it. Raises ValueError for
+    openings that do not fit.
     """
     line = np.asarray(end_xy, dtype=np.float64) - np.asarray(start_xy, dtype=np.float64)
     body = _Wall(_frame(start_xy, end_xy), float(np.hypot(*line)), height_m, thickness_m)
@@ -97,33 +98,16 @@ def wall(
     edges = [-body.reach_m, *(s for o in holes for s in (o.start_m, o.stop_m)), body.length_m + body.reach_m]
     if any(b < a for a, b in itertools.pairwise(edges)):
         raise ValueError(f"openings overlap or leave the wall of {body.length_m:.2f} m")
-    # The parts that other walls' ends cover are cut off, or their darkness would bleed into the rest.
-    joints = [
-        s for s in (thickness_m / 2, body.length_m - thickness_m / 2) if not any(_inside(s, o) for o in holes)
-    ]
-    cuts = sorted({*edges, *joints})
-    for start, stop in itertools.pairwise(cuts):
-        hole = next((o for o in holes if _inside((start + stop) / 2, o)), None)
-        parts = (
-            [(0.0, height_m)]
-            if hole is None
-            else [(0.0, hole.bottom_m), (min(hole.top_m, height_m), height_m)]
-        )
-        for bottom, top in parts:
-            if top - bottom > 1e-6:
-                body.faces(build, (start, stop), (bottom, top), textures=(left, right), cell_m=cell_m)
     inner = left if left is not None else right
     if inner is None:
         raise ValueError("a wall needs at least one face")
+    for along, up in body.closed_parts(holes):
+        body.faces(build, along, up, textures=(left, right), cell_m=cell_m)
     for hole in holes:
         body.reveal(build, hole, inner)
     body.caps(build, inner)
-    passages = [o for o in holes if o.bottom_m == 0.0]
-    ends = [
-        -body.reach_m,
-        *(s for o in passages for s in (o.start_m, o.stop_m)),
-        body.length_m + body.reach_m,
-    ]
+    passages = [s for o in holes if o.bottom_m == 0.0 for s in (o.start_m, o.stop_m)]
+    ends = [edges[0], *passages, edges[-1]]
     for start, stop in zip(ends[::2], ends[1::2], strict=True):
         if stop > start:
             body.footprint(build, (start, stop), trim)
@@ -151,6 +135,23 @@ class _Wall:
         left, right = ((s + self.reach_m) / (self.length_m + 2 * self.reach_m) for s in along)
         return left, 1.0 - up[1] / self.height_m, right, 1.0 - up[0] / self.height_m
 
+    def closed_parts(self, holes: Sequence[Opening]) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+        """Return the rectangles that remain beside, above and below openings: (along, up) intervals in m."""
+        # The parts that other walls' ends cover are cut off, or their darkness would bleed into the rest.
+        near, far = self.thickness_m / 2, self.length_m - self.thickness_m / 2
+        cuts = {s for s in (near, far) if not any(_inside(s, o) for o in holes)}
+        cuts |= {-self.reach_m, self.length_m + self.reach_m}
+        cuts |= {s for o in holes for s in (o.start_m, o.stop_m)}
+        parts = []
+        for along in itertools.pairwise(sorted(cuts)):
+            hole = next((o for o in holes if _inside(sum(along) / 2, o)), None)
+            if hole is None:
+                parts.append((along, (0.0, self.height_m)))
+                continue
+            sides = ((0.0, hole.bottom_m), (min(hole.top_m, self.height_m), self.height_m))
+            parts += [(along, up) for up in sides if up[1] - up[0] > 1e-6]
+        return parts
+
     def faces(
         self,
         build: Builder,
@@ -169,9 +170,7 @@ class _Wall:
             build.panel(front, size, textures[0], cell_m=cell_m, uv=(1 - u1, v0, 1 - u0, v1))
         if textures[1] is not None:
             back = self.frame * yaw_pose([s, 0.0, 0.0], np.pi)
-            build.panel(
-                on_wall(back, 0.0, z, off_m=off), size, textures[1], cell_m=cell_m, uv=(u0, v0, u1, v1)
-            )
+            build.panel(on_wall(back, 0.0, z, off_m=off), size, textures[1], cell_m=cell_m, uv=(u0, v0, u1, v1))
 
     def reveal(self, build: Builder, hole: Opening, texture: int) -> None:
         top = min(hole.top_m, self.height_m)

@@ -1,0 +1,290 @@
+"""The office: an open plan with rows of equal desks, two offices, a meeting room, a corridor and a kitchenette.
+
+The plan, in metres, with x to the east (0..14.9) and y to the north (0..11.0):
+
+    +-----------+-----------+--------------+  11.0
+    |  office   |  office   |   meeting    |
+    +---   -----+---   -----+---   --------+   7.7
+    |  corridor                            |
+    +---   ------------------   -+---   ---+   6.2
+    |   |===|     |===|    |===| |         |
+    |   |===|     |===|    |===|   kitchen |
+    |   |===|     |===|    |===| |         |
+    +----------------------------+---------+   0
+    0                          11.4      14.9
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fieldkit.frames import Pose, yaw_pose
+from sim_bridge.mesh import Rgb
+from sim_bridge.scenes import office_furniture as furniture
+from sim_bridge.scenes import office_prints as prints
+from sim_bridge.scenes import textures
+from sim_bridge.scenes.blueprint import Blueprint, Builder
+from sim_bridge.scenes.office_furniture import Style, hang, moved, px
+from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_frame, window
+
+LENGTH_M, WIDTH_M, HEIGHT_M = 14.9, 11.0, 2.7
+KITCHEN_X, CORRIDOR_Y, ROOMS_Y = 11.4, 6.2, 7.7
+_PX_PER_M = 110
+_WINDOW_POWER, _LAMP_POWER = 2.4, 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Paints:
+    """Texture numbers of the walls' faces: common paint, two coloured ones, stripes; and of the skirting."""
+
+    plain: int
+    accent: int
+    warm: int
+    striped: int
+    trim: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """A wall in plan, from start to end."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    def left(self, at_m: float) -> Pose:
+        """Return the frame on the left face, at_m from the start."""
+        return wall_frame(self.start, self.end, at_m)
+
+    def right(self, at_m: float) -> Pose:
+        """Return the frame on the right face, at_m from the start."""
+        return wall_frame(self.start, self.end, at_m, side="right")
+
+
+SOUTH = Line((0.0, 0.0), (LENGTH_M, 0.0))
+EAST = Line((LENGTH_M, 0.0), (LENGTH_M, WIDTH_M))
+NORTH = Line((LENGTH_M, WIDTH_M), (0.0, WIDTH_M))
+WEST = Line((0.0, WIDTH_M), (0.0, 0.0))
+FRONT = Line((0.0, CORRIDOR_Y), (LENGTH_M, CORRIDOR_Y))
+BACK = Line((0.0, ROOMS_Y), (LENGTH_M, ROOMS_Y))
+KITCHEN = Line((KITCHEN_X, 0.0), (KITCHEN_X, CORRIDOR_Y))
+# The rooms behind the corridor: their walls' x, from west to east.
+_ROOM_XS = (0.0, 4.4, 8.8, LENGTH_M)
+
+
+def office(seed: int) -> Blueprint:
+    """Make the office of 14.9 x 11.0 x 2.7 m; the same seed gives the same office."""
+    rng = np.random.default_rng([seed, 90801])
+    build = Builder()
+    look = furniture.style(build, rng)
+    paints = _paints(build, rng)
+    _shell(build, rng, paints)
+    _ceiling(build, rng)
+    _open_plan(build, rng, look)
+    _corridor(build, rng, look)
+    for i, room in enumerate(rng.permutation(2)):
+        _single_office(build, rng, look, x0=_ROOM_XS[i], variant=int(room))
+    _meeting_room(build, rng, look)
+    _kitchenette(build, rng, look)
+    bounds = (0.0, 0.0, LENGTH_M, WIDTH_M)
+    outside(build, bounds, [bounds])
+    return build.blueprint(floor_bounds=bounds)
+
+
+def _paints(build: Builder, rng: np.random.Generator) -> Paints:
+    size = (round(HEIGHT_M * _PX_PER_M), round(6 * _PX_PER_M))
+    white = np.array([224, 222, 216]) + rng.normal(0, 3, 3)
+    accent = np.array(((134, 156, 172), (168, 178, 140), (186, 140, 110))[int(rng.integers(3))]) + rng.normal(0, 5, 3)
+    warm = np.array([214, 204, 184]) + rng.normal(0, 4, 3)
+    wide = (size[0], round((LENGTH_M + 0.12) * _PX_PER_M))
+    return Paints(
+        plain=build.texture(prints.paint(rng, size, base=white)),
+        accent=build.texture(prints.paint(rng, size, base=accent)),
+        warm=build.texture(prints.paint(rng, size, base=warm)),
+        striped=build.texture(prints.stripes(rng, wide, base=white - 14, px_per_m=_PX_PER_M, pitch_m=0.3)),
+        trim=build.plain(white - 90),
+    )
+
+
+def _shell(build: Builder, rng: np.random.Generator, paints: Paints) -> None:
+    view = build.texture(prints.window_view(rng, (128, 192)))
+    rim = build.plain((206, 206, 204))
+
+    def put(line: Line, left: int | None, right: int | None, *openings: Opening) -> None:
+        wall(
+            build,
+            line.start,
+            line.end,
+            height_m=HEIGHT_M,
+            openings=openings,
+            left=left,
+            right=right,
+            trim=paints.trim,
+            cell_m=0.2,
+        )
+        for hole in openings:
+            if hole.bottom_m > 0.0:
+                window(build, line.start, line.end, hole, power=_WINDOW_POWER, texture=view, frame=rim, samples=(1, 1))
+
+    def panes(*at: float, width_m: float = 1.7) -> list[Opening]:
+        return [Opening(s, width_m, top_m=2.25, bottom_m=0.9) for s in at]
+
+    put(SOUTH, paints.plain, None, *panes(2.25, 5.7, 9.15), *panes(13.4, width_m=1.4))
+    put(EAST, paints.plain, None)
+    put(NORTH, paints.plain, None, *panes(*(LENGTH_M - x for x in (2.2, 6.6, 11.9))))
+    put(WEST, paints.accent, None)
+    put(FRONT, paints.striped, paints.plain, Opening(2.1, 1.3), Opening(9.3, 1.3), Opening(12.4, 1.2))
+    put(BACK, paints.plain, paints.warm, Opening(1.2, 1.15), Opening(7.8, 1.15), Opening(10.0, 1.15))
+    put(KITCHEN, paints.plain, paints.warm, Opening(5.35, 1.2))
+    for x in _ROOM_XS[1:3]:
+        put(Line((x, ROOMS_Y), (x, WIDTH_M)), paints.plain, paints.accent if x > 5 else paints.plain)
+
+
+def _ceiling(build: Builder, rng: np.random.Generator) -> None:
+    """Add floors, ceilings and lamps, which are alike everywhere."""
+    tone = np.array(((96, 100, 106), (112, 104, 96), (88, 98, 100))[int(rng.integers(3))])
+    carpet = build.texture(prints.carpet_tiles(rng, (300, 300), base=tone))
+    tiles = build.texture(prints.wall_tiles(rng, (300, 300), base=(188, 184, 176), tile_px=50))
+    panels = build.texture(prints.ceiling_tiles(rng, (288, 288), px_per_m=120))
+    rooms = [(0.0, 0.0, KITCHEN_X, CORRIDOR_Y), (0.0, CORRIDOR_Y, LENGTH_M, ROOMS_Y)]
+    rooms += [(a, ROOMS_Y, b, WIDTH_M) for a, b in itertools.pairwise(_ROOM_XS)]
+    kitchen = (KITCHEN_X, 0.0, LENGTH_M, CORRIDOR_Y)
+    for rect in (*rooms, kitchen):
+        floor = tiles if rect is kitchen else carpet
+        slab(build, rect, z_m=0.0, texture=floor, up=True, cell_m=0.13, tile_m=(2.0, 2.0))
+        slab(build, rect, z_m=HEIGHT_M, texture=panels, up=False, cell_m=0.6, tile_m=(2.4, 2.4))
+    for row in ((rooms[0], 4, 3), (rooms[1], 5, 1), (kitchen, 2, 2), *((r, 2, 1) for r in rooms[2:])):
+        rect, across, down = row
+        for i in range(across):
+            for j in range(down):
+                x = rect[0] + (rect[2] - rect[0]) * (i + 0.5) / across
+                y = rect[1] + (rect[3] - rect[1]) * (j + 0.5) / down
+                under = Pose.from_components([x, y, HEIGHT_M - 0.01], Rotation.from_euler("x", np.pi))
+                build.lamp(under, (1.2, 0.3), power=_LAMP_POWER, samples=(1, 1))
+
+
+def _picture(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
+    kind = str(rng.choice(list(textures.PICTURES)))
+    return textures.PICTURES[kind](rng, px(size_m))
+
+
+def _poster(build: Builder, rng: np.random.Generator, place: Pose, *, large: float = 1.0) -> None:
+    """Hang a poster on a wall's frame, at eye height or a little lower."""
+    width = large * float(rng.uniform(0.5, 0.8))
+    size = (width, width * float(rng.uniform(1.0, 1.4)))
+    at = on_wall(place, 0.0, float(rng.uniform(1.35, 1.55)), off_m=0.0)
+    hang(build, at, size, _picture(rng, size))
+
+
+def _open_plan(build: Builder, rng: np.random.Generator, look: Style) -> None:
+    """Add three double rows of desks across the room, cupboards along its north wall, and what hangs on the walls."""
+    noted = rng.permutation(3)[:2]
+    for i, x in enumerate((2.25, 5.7, 9.15)):
+        place = yaw_pose([x, 2.92, 0.0], np.pi / 2)
+        furniture.bench(build, rng, look, place, desks=2)
+        if i in noted:
+            outwards = moved(place, yaw_rad=float(rng.choice([-np.pi / 2, np.pi / 2])))
+            size = (0.6, 0.45)
+            at = on_wall(moved(outwards, y=1.656), float(rng.uniform(-0.4, 0.4)), 1.05, off_m=0.0)
+            hang(build, at, size, prints.cork(rng, px(size)), name="notices")
+    for i, x in enumerate(np.arange(3.6, 8.2, 0.9)):
+        tall = i in (0, 1, 4)
+        furniture.cupboard(build, look, FRONT.right(float(x)), height_m=2.0 if tall else 1.1)
+        if not tall:
+            furniture.litter(build, rng, moved(FRONT.right(float(x)), y=0.22), (0.85, 0.5), up_m=1.1, count=2)
+    size = (1.5, 0.9)
+    hang(build, on_wall(FRONT.right(5.85), 0.0, 1.75, off_m=0.0), size, prints.cork(rng, px(size)), name="notices")
+    size = (1.6, 1.0)
+    hang(
+        build,
+        on_wall(WEST.left(WIDTH_M - 2.9), 0.0, 1.45, off_m=0.0),
+        size,
+        prints.whiteboard(rng, px(size)),
+        name="board",
+    )
+    _poster(build, rng, WEST.left(WIDTH_M - 1.0))
+    _poster(build, rng, KITCHEN.left(2.9), large=1.3)
+    size = (1.1, 0.62)
+    hang(
+        build, on_wall(KITCHEN.left(1.3), 0.0, 1.5, off_m=0.03), size, textures.screen(rng, px(size)), name="television"
+    )
+    for at in ((10.95, 0.5), (0.5, 5.7)):
+        furniture.plant(build, rng, yaw_pose([*at, 0.0], float(rng.uniform(0, np.pi))))
+    furniture.bin_(build, yaw_pose([8.4, 5.9, 0.0], float(rng.uniform(0, np.pi))))
+
+
+def _corridor(build: Builder, rng: np.random.Generator, look: Style) -> None:
+    """Add closed doors of which each looks like the other, signs, and pictures in two places."""
+    for x in (3.3, 5.2, 13.2):
+        furniture.door(build, look, BACK.right(x))
+    for i, x in enumerate((1.95, 4.05, 7.0, 10.8)):
+        size = (0.22, 0.16)
+        text = f"{int(rng.integers(1, 4))}.{i + 11}"
+        image = prints.sign(rng, px(size), text=text, base=(70, 78, 90))
+        hang(build, on_wall(BACK.right(x), 0.0, 1.55, off_m=0.0), size, image, name="sign")
+    _poster(build, rng, BACK.right(6.3))
+    _poster(build, rng, FRONT.left(float(rng.uniform(3.6, 4.6))), large=1.2)
+    _poster(build, rng, FRONT.left(float(rng.uniform(10.6, 11.2))))
+    size = (1.2, 0.8)
+    hang(
+        build, on_wall(WEST.left(WIDTH_M - 6.95), 0.0, 1.5, off_m=0.0), size, prints.cork(rng, px(size)), name="notices"
+    )
+    _poster(build, rng, EAST.left(6.95), large=1.2)
+
+
+def _single_office(build: Builder, rng: np.random.Generator, look: Style, *, x0: float, variant: int) -> None:
+    """Add one of two alike offices: a desk, a cupboard and folders along the walls, a picture."""
+    x1 = x0 + 4.4
+    divider = Line((4.4, ROOMS_Y), (4.4, WIDTH_M))
+    # Towards the wall between the two offices, or away from it.
+    inner = divider.left(2.0) if x0 == 0.0 else divider.right(2.0)
+    outer = WEST.left(1.4) if x0 == 0.0 else Line((8.8, ROOMS_Y), (8.8, WIDTH_M)).left(1.6)
+    furniture.workplace(build, rng, look, inner)
+    furniture.bookcase(build, rng, look, NORTH.left(LENGTH_M - (x0 + 0.6)))
+    furniture.cupboard(build, look, NORTH.left(LENGTH_M - (x1 - 0.6)))
+    furniture.cupboard(build, look, outer, height_m=1.1)
+    _poster(build, rng, moved(outer, float(rng.uniform(-0.2, 0.2))), large=1.1)
+    if variant == 0:
+        size = (1.2, 0.8)
+        hang(build, on_wall(inner, 0.2, 1.55, off_m=0.0), size, prints.whiteboard(rng, px(size)), name="board")
+        furniture.carton(build, rng, yaw_pose([x0 + 3.9, ROOMS_Y + 0.45, 0.0], 0.2), height_m=0.35)
+    else:
+        _poster(build, rng, moved(inner, 0.4))
+        furniture.plant(build, rng, yaw_pose([x0 + 0.45, ROOMS_Y + 0.45, 0.0], 0.3))
+
+
+def _meeting_room(build: Builder, rng: np.random.Generator, look: Style) -> None:
+    """Add a long table with eight equal chairs, a screen, a board."""
+    middle = yaw_pose([12.0, WIDTH_M - 1.22, 0.0], 0.0)
+    furniture.table(build, look, middle, (2.6, 0.9))
+    furniture.litter(build, rng, middle, (2.4, 0.8), up_m=furniture.DESK_TOP_M, count=4)
+    for yaw in (0.0, np.pi):
+        for x in (-0.85, 0.0, 0.85):
+            spot = moved(moved(middle, yaw_rad=yaw), x + float(rng.normal(0, 0.04)), 0.55)
+            furniture.seat(build, look, moved(spot, yaw_rad=float(rng.normal(0, 0.12))))
+    size = (1.4, 0.8)
+    image = textures.screen(rng, px(size, px_per_m=300))
+    hang(build, on_wall(EAST.left(9.4), 0.0, 1.45, off_m=0.02), size, image, name="television")
+    size = (1.8, 1.1)
+    divider = Line((8.8, ROOMS_Y), (8.8, WIDTH_M))
+    hang(build, on_wall(divider.right(1.6), 0.0, 1.45, off_m=0.0), size, prints.whiteboard(rng, px(size)), name="board")
+    _poster(build, rng, BACK.left(12.6))
+
+
+def _kitchenette(build: Builder, rng: np.random.Generator, look: Style) -> None:
+    """Add a counter with equal fronts along the east wall, two tables with chairs, notices."""
+    furniture.kitchen_counter(build, rng, look, EAST.left(2.6), units=6)
+    for y in (1.65, 3.95):
+        spot = yaw_pose([12.15, y, 0.0], float(rng.normal(0, 0.1)))
+        furniture.table(build, look, spot, (0.8, 0.8), kind="movable")
+        for yaw in (0.0, -np.pi / 2, np.pi):
+            near = moved(moved(spot, yaw_rad=yaw), float(rng.normal(0, 0.04)), 0.5)
+            if rng.random() < 0.8:
+                furniture.seat(build, look, moved(near, yaw_rad=float(rng.normal(0, 0.2))))
+    size = (0.9, 0.6)
+    hang(build, on_wall(KITCHEN.right(4.4), 0.0, 1.5, off_m=0.0), size, prints.cork(rng, px(size)), name="notices")
+    size = (0.45, 0.7)
+    hang(build, on_wall(FRONT.right(13.6), 0.0, 1.5, off_m=0.0), size, prints.calendar(rng, px(size)), name="calendar")
