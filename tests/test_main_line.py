@@ -15,7 +15,7 @@ import pytest
 from transcode import transcode
 
 from fieldkit import maps, protocol, scores, store
-from fieldkit.bags import open_recording
+from fieldkit.bags import BagFormat, open_recording
 from fieldkit.frames import Pose, yaw_pose
 from fieldkit.localize import Localizer
 from fieldkit.maps import content_digest
@@ -98,9 +98,11 @@ def test_every_view_is_localized_once(run: Run) -> None:
     assert len(keys) == len(set(keys)) == sum(len(p.candidates.view_ids) for p in run.plans)
 
 
-@pytest.mark.parametrize("name", ["ros1", "ros2"])
-def test_the_other_formats_give_identical_estimates_and_trials(tmp_path: Path, short_run: Path, name: str) -> None:
-    source = transcode(SAMPLE / "session" / "robot.mcap", tmp_path, name)
+@pytest.mark.parametrize(("name", "layout"), [("ros1", "spot_ros1"), ("ros2", "spot_ros2")])
+def test_the_other_formats_and_layouts_give_identical_estimates_and_trials(
+    tmp_path: Path, short_run: Path, name: BagFormat, layout: str
+) -> None:
+    source = transcode(SAMPLE / "session" / "robot.mcap", tmp_path, name, layout=layout)
     run_sample(tmp_path / "run", source)
     assert rows(tmp_path / "run" / "estimates.csv", without=TIMES) == rows(short_run / "estimates.csv", without=TIMES)
     for table in ("trials.csv", "truth.csv", "priors.csv", "candidates.csv"):

@@ -1,4 +1,4 @@
-"""Write a recording again in another format, with parts left out."""
+"""Write a recording again in another format or layout, with parts left out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from fieldkit.bags import BagFormat, RecordingWriter
+from fieldkit.bags import LAYOUTS, BagFormat, Layout, RecordingWriter
 from fieldkit.cameras import camera_from_info
 from fieldkit.frames import Pose, pose
 
@@ -26,12 +26,18 @@ PARTS = {
 
 
 def transcode(
-    source: Path, folder: Path, format: BagFormat, *, without: Collection[str] = (), n_visits: int = 1
+    source: Path,
+    folder: Path,
+    format: BagFormat,
+    *,
+    without: Collection[str] = (),
+    n_visits: int = 1,
+    layout: str = "generic",
 ) -> Path:
-    """Copy a recording up to the end of its n-th visit into ``folder``; ``without`` names parts to leave out."""
+    """Copy a generic recording up to the end of its n-th visit; ``without`` names parts to leave out."""
     folder.mkdir(parents=True, exist_ok=True)
     path, ended = folder / NAMES[format], 0
-    with RecordingWriter(path, format=format) as writer:
+    with RecordingWriter(path, format=format, layout=layout) as writer:
         for part, t_ns, message in _messages(source):
             if part in without:
                 ended += part == "events" and json.loads(message.data)["event"] == "visit_end"
@@ -47,9 +53,9 @@ def transcode(
             elif part == "odometry":
                 writer.odometry(t_ns, _pose(message.pose.pose.position, message.pose.pose.orientation))
             elif part == "tf":
-                writer.tf(t_ns, _transforms(message))
+                writer.tf(t_ns, _transforms(message, writer.layout))
             elif part == "tf_static":
-                writer.tf_static(_transforms(message))
+                writer.tf_static(_transforms(message, writer.layout))
             else:
                 event = json.loads(message.data)
                 writer.event(t_ns, event)
@@ -70,8 +76,19 @@ def _pose(xyz: Any, q: Any) -> Pose:
     return pose(np.array([xyz.x, xyz.y, xyz.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
-def _transforms(message: Any) -> list[tuple[str, str, Pose]]:
+def _transforms(message: Any, names: Layout) -> list[tuple[str, str, Pose]]:
+    old = LAYOUTS["generic"]
+    renamed = {
+        old.odom_frame: names.odom_frame,
+        old.body_frame: names.body_frame,
+        old.camera_frame: names.camera_frame,
+        old.depth_frame: names.depth_frame,
+    }
     return [
-        (t.header.frame_id, t.child_frame_id, _pose(t.transform.translation, t.transform.rotation))
+        (
+            renamed.get(t.header.frame_id, t.header.frame_id),
+            renamed.get(t.child_frame_id, t.child_frame_id),
+            _pose(t.transform.translation, t.transform.rotation),
+        )
         for t in message.transforms
     ]

@@ -31,10 +31,9 @@ FOOTPRINT_RADIUS_M = 0.45
 
 JOINTS = ("sh0", "sh1", "el0", "el1", "wr0", "wr1")
 # Lowest and highest angle (rad) of every joint.
-SH0_RANGE_RAD = (-2.61799, 3.14159)
+SH0_RANGE_RAD = (float(np.radians(-150.0)), float(np.pi))
 LIMITS_RAD: Array = np.array(
-    [SH0_RANGE_RAD, (-3.14159, 0.52360), (0.0, 3.14159), (-2.79253, 2.79253), (-1.83260, 1.83260)]
-    + [(-2.87979, 2.87979)]
+    [SH0_RANGE_RAD, *np.radians([(-180.0, 30.0), (0.0, 180.0), (-160.0, 160.0), (-105.0, 105.0), (-165.0, 165.0)])]
 )
 # Where every joint sits in the link before it; the first in the body.
 SHOULDER_M = (0.292, 0.0, 0.188)
