@@ -31,31 +31,35 @@ def door(build: Builder, rng: np.random.Generator, place: Pose) -> float:
 
 def cupboard(build: Builder, rng: np.random.Generator, place: Pose, *, width_m: float, height_m: float) -> float:
     """Add a cupboard with doors and something on top."""
-    depth = 0.45
-    base = np.array(_WOODS[int(rng.integers(len(_WOODS)))])
-    front = build.texture(textures.doors(rng, (int(height_m * 450), int(width_m * 450)), base=base))
-    side = build.texture(textures.wood(rng, (200, 200), base=base))
-    build.box(place, [0.0, depth / 2, height_m / 2], [width_m, depth, height_m], side, front=front)
-    build.block(place * yaw_pose([0.0, depth / 2, 0.0], 0.0), (width_m, depth))
+    with build.thing("cupboard", place, kind="fixed"):
+        depth = 0.45
+        base = np.array(_WOODS[int(rng.integers(len(_WOODS)))])
+        front = build.texture(textures.doors(rng, (int(height_m * 450), int(width_m * 450)), base=base))
+        side = build.texture(textures.wood(rng, (200, 200), base=base))
+        build.box(place, [0.0, depth / 2, height_m / 2], [width_m, depth, height_m], side, front=front)
+        build.block(place * yaw_pose([0.0, depth / 2, 0.0], 0.0), (width_m, depth))
     if height_m < 1.0:
         at = place * yaw_pose([rng.uniform(-0.25, 0.25), 0.02, height_m], 0.0)
-        _carton(build, rng, at, 0.26, turn_rad=float(rng.uniform(-0.1, 0.1)))
+        with build.thing("carton", at):
+            _carton(build, rng, at, 0.26, turn_rad=float(rng.uniform(-0.1, 0.1)))
         return height_m + 0.3
     return height_m
 
 
 def bookshelf(build: Builder, rng: np.random.Generator, place: Pose, *, width_m: float) -> float:
     """Add a shelf of 2 m with rows of books and boxes."""
-    _shelf(build, rng, place * yaw_pose([0.0, 0.17, 0.0], 0.0), width_m=width_m, height_m=2.0)
+    with build.thing("shelf", place, kind="fixed"):
+        _shelf(build, rng, place * yaw_pose([0.0, 0.17, 0.0], 0.0), width_m=width_m, height_m=2.0)
     return 2.0
 
 
 def divider(build: Builder, rng: np.random.Generator, place: Pose) -> float:
     """Add a shelf across an island that shows books to both sides and hides what is behind."""
     height = float(rng.uniform(1.35, 1.7))
-    for yaw in (0.0, np.pi):
-        turned = place * yaw_pose([0.0, 0.0, 0.0], yaw)
-        _shelf(build, rng, turned * yaw_pose([0.0, 0.171, 0.0], 0.0), width_m=2.1, height_m=height)
+    with build.thing("divider", place, kind="fixed"):
+        for yaw in (0.0, np.pi):
+            turned = place * yaw_pose([0.0, 0.0, 0.0], yaw)
+            _shelf(build, rng, turned * yaw_pose([0.0, 0.171, 0.0], 0.0), width_m=2.1, height_m=height)
     return height
 
 
@@ -133,10 +137,11 @@ def _carton(
 def _stack(build: Builder, rng: np.random.Generator, place: Pose, *, turn_rad: float) -> float:
     """Pile up to three cartons and return the height."""
     z = 0.0
-    for _ in range(int(rng.integers(1, 4))):
-        at = place * yaw_pose([rng.normal(0, 0.015), 0.0, z], 0.0)
-        turn = float(np.clip(rng.normal(0, turn_rad), -0.25, 0.25))
-        z += _carton(build, rng, at, float(rng.uniform(0.25, 0.4)), turn_rad=turn, on="floor")
+    with build.thing("stack of cartons", place):
+        for _ in range(int(rng.integers(1, 4))):
+            at = place * yaw_pose([rng.normal(0, 0.015), 0.0, z], 0.0)
+            turn = float(np.clip(rng.normal(0, turn_rad), -0.25, 0.25))
+            z += _carton(build, rng, at, float(rng.uniform(0.25, 0.4)), turn_rad=turn, on="floor")
     return z
 
 
@@ -188,21 +193,23 @@ def _table(
     build: Builder, rng: np.random.Generator, place: Pose, size: tuple[float, float], *, height_m: float
 ) -> float:
     wood, leg = _wood(build, rng), build.plain((70, 70, 74))
-    build.box(place, [0.0, 0.0, height_m - 0.015], [size[0], size[1], 0.03], wood, cell_m=0.15)
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            x, y = sx * (size[0] / 2 - 0.04), sy * (size[1] / 2 - 0.04)
-            build.box(place, [x, y, (height_m - 0.03) / 2], [0.045, 0.045, height_m - 0.03], leg)
-    build.block(place, size)
+    with build.thing("table", place, kind="fixed"):
+        build.box(place, [0.0, 0.0, height_m - 0.015], [size[0], size[1], 0.03], wood, cell_m=0.15)
+        for sx in (-1, 1):
+            for sy in (-1, 1):
+                x, y = sx * (size[0] / 2 - 0.04), sy * (size[1] / 2 - 0.04)
+                build.box(place, [x, y, (height_m - 0.03) / 2], [0.045, 0.045, height_m - 0.03], leg)
+        build.block(place, size)
     return height_m
 
 
 def _monitor(build: Builder, rng: np.random.Generator, place: Pose) -> None:
     dark = build.plain((28, 28, 30))
-    build.box(place, [0.0, 0.0, 0.008], [0.24, 0.18, 0.016], dark)
-    build.box(place, [0.0, -0.03, 0.1], [0.05, 0.03, 0.18], dark)
-    image = build.texture(textures.screen(rng, (360, 600)))
-    build.box(place, [0.0, 0.0, 0.3], [0.56, 0.035, 0.34], dark, front=image)
+    with build.thing("screen", place, kind="picture"):
+        build.box(place, [0.0, 0.0, 0.008], [0.24, 0.18, 0.016], dark)
+        build.box(place, [0.0, -0.03, 0.1], [0.05, 0.03, 0.18], dark)
+        image = build.texture(textures.screen(rng, (360, 600)))
+        build.box(place, [0.0, 0.0, 0.3], [0.56, 0.035, 0.34], dark, front=image)
 
 
 def _litter(
@@ -219,14 +226,17 @@ def _litter(
         x, y = rng.uniform(-0.5, 0.5, 2) * (np.asarray(size) - 0.38)
         at = place * yaw_pose([x, y, height_m + 0.0005 * (i + 1)], rng.uniform(-np.pi, np.pi))
         kind = rng.random()
-        if kind < 0.5:
-            build.panel(at, (0.21, 0.297), build.texture(textures.page(rng, (300, 212))), solid=False)
-        elif kind < 0.8:
-            cover = build.texture(textures.shapes(rng, (180, 130)))
-            thick = float(rng.uniform(0.015, 0.05))
-            build.box(at, [0.0, 0.0, thick / 2], [0.17, 0.24, thick], build.plain((225, 220, 205)), sides={4: cover})
-        else:
-            build.box(at, [0.0, 0.0, 0.05], [0.075, 0.075, 0.1], build.texture(textures.shapes(rng, (80, 60))))
+        with build.thing("litter", at):
+            if kind < 0.5:
+                build.panel(at, (0.21, 0.297), build.texture(textures.page(rng, (300, 212))), solid=False)
+            elif kind < 0.8:
+                cover = build.texture(textures.shapes(rng, (180, 130)))
+                thick = float(rng.uniform(0.015, 0.05))
+                build.box(
+                    at, [0.0, 0.0, thick / 2], [0.17, 0.24, thick], build.plain((225, 220, 205)), sides={4: cover}
+                )
+            else:
+                build.box(at, [0.0, 0.0, 0.05], [0.075, 0.075, 0.1], build.texture(textures.shapes(rng, (80, 60))))
 
 
 def chair(build: Builder, rng: np.random.Generator, place: Pose) -> float:
@@ -235,11 +245,12 @@ def chair(build: Builder, rng: np.random.Generator, place: Pose) -> float:
         textures.tinted(textures.colour(rng, high=150), 8 * textures.fractal(rng, (128, 128), cell_px=3, octaves=2))
     )
     leg = build.plain((60, 60, 62))
-    build.box(place, [0.0, 0.0, 0.45], [0.42, 0.42, 0.045], cloth, cell_m=0.15)
-    build.box(place, [0.0, 0.2, 0.74], [0.4, 0.03, 0.4], cloth, cell_m=0.15)
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            build.box(place, [sx * 0.19, sy * 0.19, 0.215], [0.03, 0.03, 0.43], leg)
-        build.box(place, [sx * 0.17, 0.205, 0.55], [0.025, 0.02, 0.2], leg)
-    build.block(place, (0.44, 0.46))
+    with build.thing("chair", place):
+        build.box(place, [0.0, 0.0, 0.45], [0.42, 0.42, 0.045], cloth, cell_m=0.15)
+        build.box(place, [0.0, 0.2, 0.74], [0.4, 0.03, 0.4], cloth, cell_m=0.15)
+        for sx in (-1, 1):
+            for sy in (-1, 1):
+                build.box(place, [sx * 0.19, sy * 0.19, 0.215], [0.03, 0.03, 0.43], leg)
+            build.box(place, [sx * 0.17, 0.205, 0.55], [0.025, 0.02, 0.2], leg)
+        build.block(place, (0.44, 0.46))
     return 0.94

@@ -132,8 +132,9 @@ def _pictures(
         image = textures.PICTURES[kind](rng, (int(height * 700), int(width * 700)))
         at = on_wall(place, along, up, off_m=0.012)
         frame = build.plain(rng.integers(20, 90, 3))
-        build.box(at, [0.0, 0.0, -0.0065], [width + 0.03, height + 0.03, 0.011], frame, solid=False)
-        build.panel(at, (width, height), build.texture(image), solid=False)
+        with build.thing("picture", at, kind="picture"):
+            build.box(at, [0.0, 0.0, -0.0065], [width + 0.03, height + 0.03, 0.011], frame, solid=False)
+            build.panel(at, (width, height), build.texture(image), solid=False)
 
 
 def _furnish_island(build: Builder, rng: np.random.Generator, island: tuple[float, float, float, float]) -> None:
