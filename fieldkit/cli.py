@@ -16,7 +16,7 @@ from tyro.conf import Positional
 from tyro.conf import UseAppendAction as Repeated
 
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
-from fieldkit.errors import FieldkitError
+from fieldkit.errors import FieldkitError, ReplayError
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
 
@@ -191,8 +191,8 @@ def localize(
 def replay(
     recordings: Positional[tuple[Path, ...]],
     *,
-    map: Path,
     out: Path,
+    map: Path | None = None,
     tags: Path | None = None,
     protocol: str = "paper_real",
     force: bool = False,
@@ -200,23 +200,43 @@ def replay(
     """Replay recordings through every policy of a protocol; print the recall table, exit with 3 on a missed bound.
 
     Args:
-        recordings: bag files, ROS 2 bag folders, or session folders
-        map: map folder
+        recordings: bag files, ROS 2 bag folders, or session folders; or dataset folders, which have their own maps
         out: run folder to write
+        map: map folder of the recordings
         tags: tags.toml; not needed where a reference topic gives start and truth
         protocol: name of a protocol, or a .toml file
         force: replace an existing run
     """
     from fieldkit import protocol as protocols
-    from fieldkit.replay import replay as replay_recordings
+    from fieldkit.store import is_dataset
 
     rules = protocols.load(protocol)
+    sets = [r for r in recordings if is_dataset(r)]
+    _refuse_mixture(recordings, sets, map=map, tags=tags)
     with ProgressBars() as progress:
-        run = replay_recordings(
-            recordings, map_path=map, tags_path=tags, protocol=rules, out=out, force=force, progress=progress
-        )
+        if sets:
+            from fieldkit.dataset import replay_datasets
+
+            run = replay_datasets(sets, protocol=rules, out=out, force=force, progress=progress)
+        else:
+            from fieldkit.replay import replay as replay_recordings
+
+            assert map is not None
+            run = replay_recordings(
+                recordings, map_path=map, tags_path=tags, protocol=rules, out=out, force=force, progress=progress
+            )
     _print_recall(run, preset=None)
     return _missed_bounds(run)
+
+
+def _refuse_mixture(recordings: Sequence[Path], sets: Sequence[Path], *, map: Path | None, tags: Path | None) -> None:
+    """Raise ReplayError where recordings lack a map, or datasets are given with what belongs to recordings."""
+    other = next((r for r in recordings if r not in sets), None)
+    if sets and (other is not None or map is not None or tags is not None):
+        what = f"{other} is none" if other is not None else "--map or --tags is given, too"
+        raise ReplayError(f"{sets[0]}: is a dataset; {what}", hint="replay datasets alone: they hold their own maps")
+    if not sets and map is None:
+        raise ReplayError(f"{other}: no map was given; expected --map with the map of its scene", hint="give --map")
 
 
 def score(run: Positional[Path], *, preset: str | None = None, json: bool = False) -> int:

@@ -72,6 +72,10 @@ class ReplayError(FieldkitError):
     """Recordings, map and tags that do not fit together."""
 
 
+class DatasetError(FieldkitError):
+    """A dataset that cannot be made, continued or replayed as asked."""
+
+
 class JudgeError(FieldkitError):
     """A session folder without the truth that a judge needs."""
 

@@ -8,12 +8,15 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from fieldkit.bags.writing import BagFormat
 from fieldkit.errors import FieldkitError
+
+if TYPE_CHECKING:
+    from sim_bridge.dataset import Progress
 
 # The simulator itself is imported inside the command: --help must not wait for a compiler.
 
@@ -23,12 +26,16 @@ def synthesize(
     out: Path,
     scene: str = "room",
     seed: int = 0,
-    format: tuple[BagFormat, ...] | None = None,
+    format: tuple[BagFormat, ...] = (),
     layout: str = "generic",
     waypoints: int = 4,
     starts: Literal["each", "once"] = "each",
     stations: int = 54,
-    quality: int = 90,
+    quality: int | None = None,
+    sensors: str = "standard",
+    without: tuple[str, ...] = (),
+    lens: Literal["none", "radtan", "fisheye"] | None = None,
+    changes: str = "standard",
     force: bool = False,
 ) -> None:
     """Synthesize a session: mapping walk, photos of tags, robot recording, and the truth.
@@ -43,19 +50,32 @@ def synthesize(
         waypoints: number of waypoints, each with a tripod tag
         starts: each waypoint reached from the start tag, as in the paper, or once for the whole session
         stations: number of places at which the mapping rig takes its images
-        quality: JPEG quality of the arm camera's images, 1 to 100
+        quality: JPEG quality of the arm camera's images, 1 to 100; by default that of its sensor
+        sensors: what the sensors add: standard, ideal (nothing), or a TOML file like a session's sensors.toml
+        without: effects to switch off: lens, exposure, vignetting, noise, blur, jpeg, depth_noise, depth_holes
+        lens: distortion of the arm's camera; by default that of its sensor
+        changes: what changes between the mapping walk and the robot's visit: standard, none, or a TOML file like a
+            session's changes.toml
         force: replace an existing folder
     """
     from sim_bridge.errors import SynthesisError
     from sim_bridge.recording.recorder import own_format
-    from sim_bridge.sensors import with_quality
+    from sim_bridge.scenes.changes import find_changes
+    from sim_bridge.sensors import load_sensors, with_lens, with_quality
+    from sim_bridge.sensors import without as switched_off
     from sim_bridge.synthesize import SessionOptions
     from sim_bridge.synthesize import synthesize as write_session
 
-    limits = (("waypoints", waypoints, 1, 20), ("stations", stations, 2, 999), ("quality", quality, 1, 100))
+    limits = (
+        ("waypoints", waypoints, 1, 20),
+        ("stations", stations, 2, 999),
+        ("quality", 90 if quality is None else quality, 1, 100),
+    )
     for name, value, low, high in limits:
         if not low <= value <= high:
             raise SynthesisError(f"--{name} {value}: expected {low}..{high}", hint="choose another number")
+    chosen = load_sensors(sensors) if lens is None else with_lens(load_sensors(sensors), lens)
+    chosen = switched_off(chosen if quality is None else with_quality(chosen, quality), without)
     standard = SessionOptions()
     options = dataclasses.replace(
         standard,
@@ -63,14 +83,72 @@ def synthesize(
         stage=dataclasses.replace(standard.stage, waypoints=waypoints),
         schedule=dataclasses.replace(standard.schedule, starts=starts),
         recorder=dataclasses.replace(standard.recorder, layout=layout),
-        sensors=with_quality(standard.sensors, quality),
+        sensors=chosen,
+        changes=find_changes(changes),
     )
     begin = time.monotonic()
     write_session(scene, out, seed=seed, formats=format or (own_format(layout),), options=options, force=force)
     logging.getLogger(__name__).info("%s written in %.0f s", out, time.monotonic() - begin)
 
 
-COMMANDS = {"synthesize": synthesize}
+def dataset(
+    *,
+    scenes: tuple[str, ...],
+    out: Path,
+    seed: int = 0,
+    waypoints: int = 100,
+    views: int = 50,
+    workers: int = 2,
+    sensors: str = "standard",
+    repeats: int = 0,
+    repeat_share: float = 0.1,
+    force: bool = False,
+) -> None:
+    """Make a dataset: many views of scenes, localized in maps of them; features and labels are stored, no images.
+
+    A killed run goes on with the same command. Replay it with `fieldkit replay OUT --protocol paper_sim --out RUN`.
+
+    Args:
+        scenes: names of scenes
+        out: dataset folder to write, or to go on with
+        seed: the same seed gives the same bytes
+        waypoints: places per scene
+        views: directions per place, besides the stowed and the forward view
+        workers: processes; their number does not change the result
+        sensors: standard, ideal, or a sensors.toml
+        repeats: further localizations with new noise, of a share of the views
+        repeat_share: share of the views that are localized again
+        force: make the views again where settings differ; maps that still fit are kept
+    """
+    from sim_bridge.dataset import DatasetOptions, make_scenes
+
+    options = DatasetOptions(seed, waypoints, views, sensors, repeats, repeat_share)
+    made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())
+    for row in made:
+        again = "" if not row.repeats else f", {row.repeats} repeats: {100 * row.flipped:.1f} % change the label"
+        print(
+            f"{row.scene}: {row.waypoints} of {row.planned} waypoints, {row.views} views, "
+            f"{100 * row.localized:.1f} % localize{again}"
+        )
+
+
+class _ProgressLines:
+    """Log how far a dataset is, every few seconds."""
+
+    def __init__(self, *, every_s: float = 5.0) -> None:
+        self._every_s, self._last = every_s, -every_s
+
+    def __call__(self, at: Progress) -> None:
+        if at.seconds - self._last < self._every_s:
+            return
+        self._last = at.seconds
+        left = "" if at.seconds_left is None else f", {at.seconds_left / 60:.1f} min left"
+        speed = f"{at.images / at.seconds:.1f} views/s" if at.images else "preparing"
+        where = ", ".join(at.what)
+        logging.getLogger(__name__).info("%d of %d waypoints, %s%s | %s", at.done, at.total, speed, left, where)
+
+
+COMMANDS = {"synthesize": synthesize, "dataset": dataset}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -142,10 +142,15 @@ def chapter(run: Run, number: int) -> Chapter:
         legend=tuple(style(s.policy, s.occlusion) for s in summaries),
         plan_legend=tuple(style(s.policy, s.occlusion) for s in summaries if s.policy not in (ODOMETRY, "random")),
         curves=curves,
-        plan=Markup(figures.plan_svg(run, visits, name=f"{anchor}m")) if visits else None,
+        plan=Markup(figures.plan_svg(run, visits, name=f"{anchor}m")) if visits and _one_map(run) else None,
         waypoints=tuple(_waypoint(run, visit, f"{anchor}w{i}") for i, visit in enumerate(visits)),
         excluded=tuple((e.what, e.reason) for e in run.excluded),
     )
+
+
+def _one_map(run: Run) -> bool:
+    """Tell whether all waypoints lie in one map: several scenes of a dataset cannot be drawn in one picture."""
+    return len(run.sessions) < 2 or len(run.plan_view.cameras) > 0
 
 
 def _words(threshold: Threshold) -> str:

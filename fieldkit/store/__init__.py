@@ -1,5 +1,6 @@
 """Nouns on disk: text files that others read, content digests, and writing that leaves the old or the new."""
 
+from fieldkit.store.datasets import is_dataset
 from fieldkit.store.files import (
     atomic_folder,
     atomic_write,
@@ -39,6 +40,7 @@ __all__ = [
     "atomic_folder",
     "atomic_write",
     "digest",
+    "is_dataset",
     "library_versions",
     "plain_json",
     "read_camera",

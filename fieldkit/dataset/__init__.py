@@ -1,0 +1,19 @@
+"""Datasets: the views of many scenes and waypoints, localized, as features and labels; made once, replayed often."""
+
+from fieldkit.dataset.counting import SceneCount, count_scenes
+from fieldkit.dataset.making import Progress, make_dataset
+from fieldkit.dataset.replaying import replay_datasets
+from fieldkit.dataset.source import SourceView, SourceWaypoint, ViewSource
+from fieldkit.store.datasets import DatasetRules
+
+__all__ = [
+    "DatasetRules",
+    "Progress",
+    "SceneCount",
+    "SourceView",
+    "SourceWaypoint",
+    "ViewSource",
+    "count_scenes",
+    "make_dataset",
+    "replay_datasets",
+]

@@ -1,0 +1,299 @@
+"""Make a dataset: scenes x waypoints x views, localized and stored as features and labels, by worker processes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import multiprocessing
+import os
+import pickle
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing import connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+from fieldkit.dataset import worker
+from fieldkit.dataset.source import ViewSource
+from fieldkit.errors import DatasetError
+from fieldkit.store import library_versions, refuse_existing
+from fieldkit.store.datasets import (
+    DATASET_FILE,
+    MAPS_FOLDER,
+    DatasetFile,
+    DatasetRules,
+    is_dataset,
+    read_dataset,
+    write_dataset,
+)
+from fieldkit.store.files import plain, saving
+
+# One thread each: as many processes as asked for share the machine, and results do not depend on its processors.
+ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """How far a dataset is: what each worker does, shards done and in all, images localized and seconds in this run."""
+
+    what: tuple[str, ...]
+    done: int
+    total: int
+    images: int
+    seconds: float
+    seconds_left: float | None
+
+
+@dataclasses.dataclass
+class _Scene:
+    name: str
+    source: bytes
+    opened: bool = False
+    todo: list[str] = dataclasses.field(default_factory=list)
+    total: int = 0
+
+
+@dataclasses.dataclass
+class _Lane:
+    """A worker process and what it is at."""
+
+    process: BaseProcess
+    pipe: connection.Connection
+    scene: _Scene | None = None
+    busy: str = ""
+
+
+def make_dataset(
+    sources: Sequence[ViewSource],
+    out: Path,
+    *,
+    described: Mapping[str, Any],
+    rules: DatasetRules | None = None,
+    workers: int = 1,
+    force: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> None:
+    """Make the dataset folder ``out``, or go on with one that was made with the same settings.
+
+    A killed run goes on where it was; the bytes do not depend on kills or the number of ``workers``. ``described``
+    are the options of the sources as plain values: they are stored, and have to agree with those of an existing
+    folder. ``force`` makes shards again that were made otherwise and keeps the maps that still fit. Raises
+    DatasetError or StoreError where the folder cannot be used, or a scene cannot be mapped.
+    """
+    rules, out = rules or DatasetRules(), Path(out)
+    names = [s.name for s in sources]
+    if not names or len(set(names)) < len(names):
+        raise DatasetError(f"scenes are {', '.join(names) or 'none'}; expected each once", hint="name a scene once")
+    if workers < 1:
+        raise DatasetError(f"{workers} workers; expected at least 1", hint="choose another number")
+    with _own(out):
+        _prepare(out, names, rules, plain(dict(described)), force=force)
+        scenes = [_Scene(s.name, pickle.dumps(s)) for s in sources]
+        try:
+            with _workers(min(workers, 64), out, rules) as lanes:
+                _Foreman(scenes, lanes, progress).run()
+        finally:
+            shutil.rmtree(out / worker.WORK_FOLDER, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _own(out: Path) -> Iterator[None]:
+    """Hold the folder alone: two runs at once would do the same work twice."""
+    if not is_dataset(out):
+        refuse_existing(out, force=False, kind="folder")
+    with saving(out):
+        out.mkdir(parents=True, exist_ok=True)
+        stream = (out / ".lock").open("w")
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise DatasetError(f"{out}: another run is making it", hint="wait for it, or end it") from error
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                (out / ".lock").unlink()
+
+
+def _prepare(out: Path, names: list[str], rules: DatasetRules, described: dict[str, Any], *, force: bool) -> None:
+    """Write dataset.toml, or hold the one that is there against what is asked for; clear what a kill left behind."""
+    head = DatasetFile(1, tuple(names), rules, described, library_versions())
+    with saving(out):
+        if is_dataset(out) and force:
+            _clear(out)
+        if is_dataset(out):
+            before = read_dataset(out)
+            _refuse_other(out, before, head)
+            added = tuple(n for n in names if n not in before.scenes)
+            head = DatasetFile(1, (*before.scenes, *added), rules, described, before.versions)
+            if added:
+                write_dataset(out, head)
+        else:
+            write_dataset(out, head)
+        shutil.rmtree(out / worker.WORK_FOLDER, ignore_errors=True)
+        (out / worker.WORK_FOLDER).mkdir()
+        for folder in (out, out / MAPS_FOLDER, *(out / name for name in head.scenes)):
+            for left in folder.glob(".*.*"):
+                left.unlink() if left.is_file() else shutil.rmtree(left)
+
+
+def _clear(out: Path) -> None:
+    """Take away what --force makes again; the maps stay, and are used where their keys fit."""
+    for name in read_dataset(out).scenes:
+        shutil.rmtree(out / name, ignore_errors=True)
+    (out / DATASET_FILE).unlink()
+
+
+def _refuse_other(out: Path, before: DatasetFile, now: DatasetFile) -> None:
+    """Raise DatasetError that names the first setting which differs from that of the existing folder."""
+    old, new = (_leaves({"rules": h.rules, "source": h.source, "versions": h.versions}) for h in (before, now))
+    for key in {**old, **new}:
+        if old.get(key) != new.get(key):
+            raise DatasetError(
+                f"{out}: was made with other settings: {key} is {old.get(key, 'not set')}; now it would be "
+                f"{new.get(key, 'not set')}",
+                hint="give --force to make it again (maps that still fit are kept), or choose another --out",
+            )
+
+
+def _leaves(values: Any, *, prefix: str = "") -> dict[str, Any]:
+    """Return nested plain values by their dotted places; what is None is as good as missing."""
+    result: dict[str, Any] = {}
+    for key, value in plain(values).items():
+        if isinstance(value, dict):
+            result |= _leaves(value, prefix=f"{prefix}{key}.")
+        elif value is not None:
+            result[prefix + key] = list(value) if isinstance(value, tuple) else value
+    return result
+
+
+@contextlib.contextmanager
+def _workers(count: int, out: Path, rules: DatasetRules) -> Iterator[list[_Lane]]:
+    context = multiprocessing.get_context("spawn")
+    lanes: list[_Lane] = []
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        for number in range(count):
+            ours, theirs = context.Pipe()
+            process = context.Process(
+                target=worker.serve, args=(theirs, out, rules), name=f"dataset-{number + 1}", daemon=True
+            )
+            process.start()
+            theirs.close()
+            lanes.append(_Lane(process, ours))
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)
+    try:
+        yield lanes
+        for lane in lanes:
+            lane.pipe.close()
+        for lane in lanes:
+            lane.process.join(10.0)
+    finally:
+        # Nothing that a worker leaves behind matters: what it writes is written whole or not at all.
+        for lane in lanes:
+            lane.process.kill()
+            lane.process.join()
+
+
+class _Foreman:
+    """Hands out the work: a worker stays with its scene, opens the next one, or helps where most is left."""
+
+    def __init__(self, scenes: list[_Scene], lanes: list[_Lane], progress: Callable[[Progress], None] | None) -> None:
+        self._scenes, self._lanes, self._progress = scenes, lanes, progress
+        self._waiting = list(scenes)
+        self._begin = time.monotonic()
+        self._images = self._made = 0
+        self._first_made: float | None = None
+
+    def run(self) -> None:
+        """Work until every shard of every scene is there."""
+        while True:
+            for lane in self._lanes:
+                if not lane.busy:
+                    self._hand_out(lane)
+            busy = [lane for lane in self._lanes if lane.busy]
+            if not busy:
+                return
+            self._tell()
+            ends = {lane.pipe: lane for lane in busy}
+            for pipe in connection.wait(list(ends), timeout=1.0):
+                lane = ends[pipe]  # type: ignore[index]
+                self._receive(lane)
+
+    def _hand_out(self, lane: _Lane) -> None:
+        scene = lane.scene
+        if scene is None or not scene.todo:
+            if self._waiting:
+                scene = self._waiting.pop(0)
+                lane.scene, lane.busy = scene, scene.name
+                self._send(lane, worker.Open(scene.source))
+                return
+            # A second worker pays the opening of a scene: not for a shard or two.
+            left = [s for s in self._scenes if len(s.todo) > 2]
+            if not left:
+                return
+            scene = max(left, key=lambda s: len(s.todo))
+        lane.scene = scene
+        waypoint = scene.todo.pop(0)
+        lane.busy = f"{scene.name}/{waypoint}"
+        self._send(lane, worker.Make(scene.source, waypoint))
+
+    def _send(self, lane: _Lane, request: worker.Open | worker.Make) -> None:
+        try:
+            lane.pipe.send(request)
+        except OSError as error:
+            raise self._died(lane) from error
+
+    def _receive(self, lane: _Lane) -> None:
+        try:
+            answer = lane.pipe.recv()
+        except (EOFError, OSError) as error:
+            raise self._died(lane) from error
+        match answer:
+            case worker.Step(what, done, total):
+                lane.busy = f"{what} {done}/{total}" if total > 1 else what
+                return
+            case worker.Failed(line, trace):
+                if line is None:
+                    raise RuntimeError(f"a worker of the dataset failed at {lane.busy}:\n{trace}")
+                raise DatasetError(line)
+            case worker.Opened(waypoints, done):
+                assert lane.scene is not None
+                lane.scene.todo = [w for w in waypoints if w not in set(done)]
+                lane.scene.total, lane.scene.opened = len(waypoints), True
+            case worker.Made(images):
+                self._images += images
+                self._made += 1
+        lane.busy = ""
+
+    def _died(self, lane: _Lane) -> DatasetError:
+        lane.process.join(5.0)
+        return DatasetError(
+            f"the worker at {lane.busy} ended with status {lane.process.exitcode}; expected it to go on",
+            hint="see the lines above, free memory or disk, and give the same command: it goes on from here",
+        )
+
+    def _tell(self) -> None:
+        if self._progress is None:
+            return
+        now = time.monotonic()
+        if self._first_made is None and any(lane.busy and "/" in lane.busy for lane in self._lanes):
+            self._first_made = now
+        opened = [s for s in self._scenes if s.opened]
+        running = sum(lane.scene is not None and "/" in lane.busy for lane in self._lanes)
+        left = sum(len(s.todo) for s in opened) + running
+        total = sum(s.total for s in opened)
+        # Scenes that are not open yet are taken to be as large as the others.
+        closed = len(self._scenes) - len(opened)
+        each = total / len(opened) if opened else 0.0
+        seconds = now - self._begin
+        remaining = None if not self._made else (left + closed * each) * seconds / self._made
+        what = tuple(lane.busy for lane in self._lanes if lane.busy)
+        self._progress(Progress(what, total - left, round(total + closed * each), self._images, seconds, remaining))

@@ -1,0 +1,226 @@
+"""A worker process of a dataset: opens one scene at a time, makes its map where there is none, and its shards."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pickle
+import shutil
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable
+from multiprocessing import connection, parent_process
+from pathlib import Path
+
+import cv2
+
+from fieldkit import maps
+from fieldkit.dataset.looking import Studio
+from fieldkit.dataset.source import SourceWaypoint, ViewSource
+from fieldkit.errors import DatasetError, FieldkitError
+from fieldkit.frames import pose, position_quaternion
+from fieldkit.store import digest
+from fieldkit.store.datasets import (
+    MAPS_FOLDER,
+    SCENE_FILE,
+    DatasetRules,
+    GaugeFile,
+    SceneFile,
+    gauge_path,
+    read_gauge,
+    read_scene,
+    shard_path,
+    write_gauge,
+    write_scene,
+    write_shard,
+)
+from fieldkit.store.files import saving
+
+Tell = Callable[[str, int, int], None]
+WORK_FOLDER = ".work"
+
+
+@dataclasses.dataclass(frozen=True)
+class Open:
+    """Open a scene: make its map and scene.toml where they are missing; answered by `Opened`."""
+
+    source: bytes
+
+
+@dataclasses.dataclass(frozen=True)
+class Opened:
+    """The waypoints of a scene in order, and those whose shards are there already."""
+
+    waypoints: tuple[str, ...]
+    done: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Make:
+    """Make the shard of a waypoint of a scene; answered by `Made`."""
+
+    source: bytes
+    waypoint: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """A shard was written: how many images were localized for it."""
+
+    images: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """How far a long step of `Open` is."""
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Failed:
+    """What went wrong: one line of a mistake, or the traceback of a defect."""
+
+    line: str | None
+    trace: str
+
+
+def serve(pipe: connection.Connection, out: Path, rules: DatasetRules) -> None:
+    """Answer requests until the pipe is closed; the process ends with the one that started it, however that ended."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    cv2.setNumThreads(1)
+    tempfile.tempdir = str(out / WORK_FOLDER)
+    desk: Desk | None = None
+    while True:
+        try:
+            request = pipe.recv()
+        except EOFError:
+            return
+        try:
+            if desk is None or desk.source_bytes != request.source:
+                desk = None
+                desk = Desk(request.source, out, rules, lambda *step: pipe.send(Step(*step)))
+            pipe.send(desk.opened() if isinstance(request, Open) else desk.make(request.waypoint))
+        except FieldkitError as error:
+            pipe.send(Failed(str(error), ""))
+        except OSError as error:
+            place = f"{os.fsdecode(error.filename)}: " if error.filename else f"{out}: "
+            line = f"{place}{error.strerror or error}; the same command goes on from here once that is put right"
+            pipe.send(Failed(line, ""))
+        except Exception:
+            pipe.send(Failed(None, traceback.format_exc()))
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+class Desk:
+    """One opened scene: its source, its waypoints, its map and its localizer."""
+
+    def __init__(self, source_bytes: bytes, out: Path, rules: DatasetRules, tell: Tell) -> None:
+        self.source_bytes = source_bytes
+        self._source: ViewSource = pickle.loads(source_bytes)
+        self._out, self._rules, self._tell = out, rules, tell
+        name = self._source.name
+        tell(f"{name}: scene", 0, 1)
+        self._key = views_key(self._source, rules)
+        folder = out / MAPS_FOLDER / f"{name}-{map_key(self._source, rules)[:16]}.map"
+        gauge = build_scene_map(self._source, folder, rules, tell)
+        tell(f"{name}: waypoints", 0, 1)
+        self._waypoints = {w.id: w for w in self._source.waypoints()}
+        scene_map = maps.load_map(folder)
+        self._studio = Studio(self._source, scene_map, gauge, rules)
+        entry = SceneFile(
+            version=1,
+            name=name,
+            mapping_key=map_key(self._source, rules),
+            views_key=self._key,
+            map=folder.name,
+            map_digest=scene_map.digest,
+            waypoints=tuple(self._waypoints),
+        )
+        _keep_or_write(out, entry)
+
+    def opened(self) -> Opened:
+        """Return the waypoints, and which of them are done."""
+        name = self._source.name
+        done = tuple(w for w in self._waypoints if shard_path(self._out, name, w).is_file())
+        return Opened(tuple(self._waypoints), done)
+
+    def make(self, waypoint: str) -> Made:
+        """Make the shard of a waypoint and write it."""
+        chosen: SourceWaypoint = self._waypoints[waypoint]
+        shard = self._studio.shard(chosen, key=self._key)
+        write_shard(shard_path(self._out, self._source.name, waypoint), shard)
+        return Made(len(shard.view_ids) + len(shard.repeat_view))
+
+
+def _keep_or_write(out: Path, entry: SceneFile) -> None:
+    """Write scene.toml; raises DatasetError when the scene's shards were made from something else."""
+    if not (out / entry.name / SCENE_FILE).is_file():
+        write_scene(out, entry)
+        return
+    before = read_scene(out, entry.name)
+    if before != entry:
+        changed = next(f for f in SceneFile.__struct_fields__ if getattr(before, f) != getattr(entry, f))
+        raise DatasetError(
+            f"{out / entry.name}: was made from another version of the scene {entry.name!r} ({changed} differs); "
+            "expected the same scene, options and program",
+            hint="give --force to make the dataset again (maps that still fit are kept), or choose another --out",
+        )
+
+
+def map_key(source: ViewSource, rules: DatasetRules) -> str:
+    """Return the digest of all that a map depends on."""
+    return digest(source.mapping_key, rules.feature, repr(maps.MapOptions()))
+
+
+def views_key(source: ViewSource, rules: DatasetRules) -> str:
+    """Return the digest of all that the shards of a scene depend on."""
+    return digest(map_key(source, rules), source.views_key, repr(rules))
+
+
+def build_scene_map(source: ViewSource, path: Path, rules: DatasetRules, tell: Tell) -> maps.Gauge:
+    """Make the map of a source at ``path`` where there is none; return the gauge between map and world.
+
+    The gauge needs the true mapping poses, which are not kept: it is stored beside the map, and before it.
+    """
+    if path.is_dir() and gauge_path(path).is_file():
+        return _read_gauge(path)
+    with saving(path):
+        shutil.rmtree(path, ignore_errors=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f"{source.name}-"))
+    try:
+        tell(f"{source.name}: mapping images", 0, 1)
+        (work / "mapping").mkdir()
+        true = source.write_mapping(work / "mapping")
+        maps.build_map(
+            work / "mapping",
+            work / path.name,
+            feature=rules.feature,
+            progress=lambda step, done, total: tell(f"{source.name}: map, {step}", done, total),
+        )
+        gauge = maps.fit_gauge(maps.load_map(work / path.name), true)
+        position, quaternion = position_quaternion(gauge.world_from_map)
+        write_gauge(
+            path,
+            GaugeFile(1, tuple(position), tuple(quaternion), gauge.rms_m, gauge.max_m, gauge.scale_error),
+        )
+        with saving(path):
+            (work / path.name).rename(path)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return _read_gauge(path)
+
+
+def _read_gauge(path: Path) -> maps.Gauge:
+    entry = read_gauge(path)
+    return maps.Gauge(pose(entry.position_m, entry.quaternion_xyzw), entry.rms_m, entry.max_m, entry.scale_error)

@@ -1,0 +1,254 @@
+"""The scenes as view sources of `fieldkit.dataset`: mapped as they were, looked at as they have become."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from fieldkit.dataset import (
+    DatasetRules,
+    Progress,
+    SceneCount,
+    SourceView,
+    SourceWaypoint,
+    count_scenes,
+    make_dataset,
+)
+from fieldkit.errors import suggestion
+from fieldkit.frames import Pose, exp
+from fieldkit.store import digest, write_rig, write_tum
+from fieldkit.types import Array, Image
+from sim_bridge import robot
+from sim_bridge.errors import SynthesisError
+from sim_bridge.mapping import mapper
+from sim_bridge.mesh import Scene
+from sim_bridge.rendering import render
+from sim_bridge.scenes import SCENES, make_blueprint
+from sim_bridge.scenes.blueprint import Blueprint
+from sim_bridge.scenes.light import lit
+from sim_bridge.sensors import STANDARD, Motion, Sensors, bent, encode, expose, load_sensors
+from sim_bridge.stage.lookouts import Lookout, LookoutOptions, find_lookouts
+
+# Raised when the same blueprint and options give other mapping images, or other views, than before.
+MAPPING_VERSION, VIEWS_VERSION = 1, 1
+
+
+@dataclasses.dataclass(frozen=True)
+class PriorNoise:
+    """Standard deviations of the prior at a waypoint, about what odometry loses on ten metres.
+
+    ``position_m`` along each horizontal axis, ``height_m`` along the vertical; ``tilt_deg`` about each horizontal axis.
+    """
+
+    position_m: float = 0.10
+    height_m: float = 0.01
+    yaw_deg: float = 1.5
+    tilt_deg: float = 0.2
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (6,): rotation in rad, then translation in m, in the body's frame."""
+        tilt, yaw = np.radians(self.tilt_deg), np.radians(self.yaw_deg)
+        return np.array([tilt, tilt, yaw, self.position_m, self.position_m, self.height_m])
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneOptions:
+    """How a scene is mapped and looked at; the same options and seed give the same bytes.
+
+    ``tremor_deg_s`` is the standard deviation of the standing robot's turning about each axis of the camera.
+    """
+
+    seed: int = 0
+    walk: mapper.WalkOptions = dataclasses.field(default_factory=mapper.WalkOptions)
+    lookouts: LookoutOptions = dataclasses.field(default_factory=LookoutOptions)
+    prior: PriorNoise = dataclasses.field(default_factory=PriorNoise)
+    sensors: Sensors = STANDARD
+    kinematics: robot.KinematicOptions = dataclasses.field(default_factory=robot.KinematicOptions)
+    tremor_deg_s: float = 1.2
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneSource:
+    """A named scene as a view source; whatever is costly is made at its first use."""
+
+    name: str
+    options: SceneOptions
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"name": self.name, "options": self.options}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+    @functools.cached_property
+    def _blueprint(self) -> Blueprint:
+        return make_blueprint(self.name, self.options.seed)
+
+    @functools.cached_property
+    def mapping_key(self) -> str:
+        """Digest of the scene and of all that its mapping depends on."""
+        o = self.options
+        mapping = o.sensors.mapping, o.sensors.mapping_depth
+        return digest(blueprint_digest(self._blueprint), repr((MAPPING_VERSION, o.seed, o.walk)), repr(mapping))
+
+    @functools.cached_property
+    def views_key(self) -> str:
+        """Digest of all that waypoints and images depend on."""
+        return digest(self.mapping_key, repr((VIEWS_VERSION, self.options)))
+
+    def write_mapping(self, folder: Path) -> Mapping[str, Pose]:
+        """Write the mapping walk through the scene as it was; return world_from_cam by image name."""
+        options, sensors, seed = self.options.walk, self.options.sensors, self.options.seed
+        scene = lit(self._blueprint, rng=np.random.default_rng([seed, 90709]))
+        stations = mapper.walk(scene, options, rng=_generator(seed, 1))
+        write_rig(folder / "rig.toml", mapper.hololens_rig(sensors.mapping))
+        write_tum(folder / "slam_poses.txt", [(s.frame, s.slam_from_rig) for s in stations])
+        true = {}
+        for name, world_from_cam, data in mapper.images(scene, stations, sensors.mapping, rng=_generator(seed, 2)):
+            _write(folder / "images" / name, data)
+            true[name] = world_from_cam
+        for name, data in mapper.depths(scene, stations, sensors.mapping_depth, rng=_generator(seed, 3)):
+            _write(folder / "depth" / name, data)
+        return true
+
+    @functools.cached_property
+    def _scene(self) -> Scene:
+        return lit(self._blueprint, rng=np.random.default_rng([self.options.seed, 90709]))
+
+    @functools.cached_property
+    def _arm(self) -> robot.Kinematics:
+        return robot.assembled(self.options.kinematics, rng=_generator(self.options.seed, 25))
+
+    def waypoints(self) -> Sequence[SourceWaypoint]:
+        """Return the waypoints of a round trip through the scene as it has become."""
+        found = find_lookouts(self._scene, self.options.lookouts, rng=_generator(self.options.seed, 21))
+        return tuple(self._waypoint(lookout, number) for number, lookout in enumerate(found))
+
+    def _waypoint(self, lookout: Lookout, number: int) -> SourceWaypoint:
+        sigmas = self.options.prior.sigmas
+        error = sigmas * np.random.default_rng([self.options.seed, 22, number]).standard_normal(6)
+        rng = np.random.default_rng([self.options.seed, 24, number])
+        views = tuple(
+            SourceView(
+                name,
+                kind,
+                robot.body_from_camera(self._arm.measured(arm, rng=rng)),
+                lookout.world_from_body * self._arm.body_from_camera(arm),
+            )
+            for name, kind, arm in lookout.arms
+        )
+        return SourceWaypoint(
+            id=lookout.id,
+            world_from_body=lookout.world_from_body,
+            world_from_prior=lookout.world_from_body * exp(error).inv(),
+            prior_covariance=np.diag(sigmas**2),
+            camera=bent(robot.ARM_CAMERA, self.options.sensors.hand),
+            views=views,
+            next=lookout.next,
+        )
+
+    def shoot(self, waypoint: SourceWaypoint, view: SourceView, *, repeat: int = 0) -> Image:
+        """Render a view and add what the hand's camera adds."""
+        rng = np.random.default_rng([self.options.seed, 23, repeat, *f"{waypoint.id}/{view.id}".encode()])
+        turning = np.radians(self.options.tremor_deg_s) * rng.standard_normal(3)
+        sensor, camera = self.options.sensors.hand, waypoint.camera
+        shot = render(self._scene, camera, view.world_from_cam).rgb
+        exposed = expose(shot, sensor, camera=camera, rng=rng, motion=Motion(turning, np.zeros(3)))
+        return _decoded(encode(exposed, sensor))
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetOptions:
+    """What is asked for of every scene: places, directions, sensors by name or file, and repeated localizations."""
+
+    seed: int = 0
+    waypoints: int = 100
+    views: int = 50
+    sensors: str = "standard"
+    repeats: int = 0
+    repeat_share: float = 0.1
+
+
+def make_scenes(
+    scenes: Sequence[str],
+    out: Path,
+    *,
+    options: DatasetOptions,
+    workers: int = 2,
+    force: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> tuple[SceneCount, ...]:
+    """Make a dataset of scenes by name, or go on with it, and count what it holds.
+
+    Raises SynthesisError for an unknown scene or a number out of range, and what `make_dataset` raises.
+    """
+    limits = (("waypoints", 1, 9999), ("views", 1, 999), ("seed", 0, 2**31 - 1), ("repeats", 0, 999))
+    for name, low, high in limits:
+        if not low <= getattr(options, name) <= high:
+            raise SynthesisError(
+                f"--{name} {getattr(options, name)}: expected {low}..{high}", hint="choose another number"
+            )
+    if not 0.0 < options.repeat_share <= 1.0:
+        raise SynthesisError(f"--repeat-share {options.repeat_share:g}: expected more than 0, at most 1")
+    for name in scenes:
+        if name not in SCENES:
+            raise SynthesisError(f"unknown scene {name!r}", hint=suggestion(name, list(SCENES)))
+    chosen = SceneOptions(
+        seed=options.seed,
+        lookouts=LookoutOptions(count=options.waypoints, views=options.views),
+        sensors=load_sensors(options.sensors),
+    )
+    rules = DatasetRules(repeats=options.repeats, repeat_share=options.repeat_share)
+    make_dataset(
+        [SceneSource(name, chosen) for name in scenes],
+        out,
+        described=json.loads(json.dumps(dataclasses.asdict(chosen), default=msgspec.to_builtins)),
+        rules=rules,
+        workers=workers,
+        force=force,
+        progress=progress,
+    )
+    return count_scenes(out)
+
+
+def blueprint_digest(blueprint: Blueprint) -> str:
+    """Return the digest of everything that a blueprint holds."""
+    parts: list[bytes | str] = [repr((blueprint.floor_bounds, blueprint.walk_xy.tolist()))]
+    for quad in blueprint.quads:
+        parts.append(quad.corners.tobytes() + quad.normal.tobytes())
+        parts.append(repr((quad.texture, quad.cell_m, quad.solid, quad.closed, quad.glow, quad.thing)))
+    for texture in blueprint.textures:
+        parts += [repr(texture.shape), np.ascontiguousarray(texture).tobytes()]
+    for block in blueprint.blocks:
+        parts += [np.asarray(block.corners_xy).tobytes(), repr(block.thing)]
+    for thing in blueprint.things:
+        parts += [repr((thing.name, thing.kind)), thing.world_from_thing.as_matrix().tobytes()]
+    for lamp in blueprint.lamps:
+        parts += [lamp.points.tobytes(), np.asarray(lamp.normal).tobytes(), repr((lamp.power, lamp.group))]
+    return digest(*parts)
+
+
+def _decoded(jpeg: bytes) -> Image:
+    """Return the RGB image of a JPEG file, as a reader of recordings would."""
+    bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert bgr is not None
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _generator(seed: int, part: int) -> np.random.Generator:
+    """Return the generator of one part, independent of what the other parts draw."""
+    return np.random.default_rng([seed, part])
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
