@@ -28,7 +28,8 @@ from sim_bridge.errors import SynthesisError
 from sim_bridge.mapping import mapper, photographer
 from sim_bridge.mesh import Scene
 from sim_bridge.recording import recorder, schedule
-from sim_bridge.scenes import make_scene
+from sim_bridge.scenes import make_blueprint
+from sim_bridge.scenes.changes import STANDARD_CHANGES, ChangeOptions, make_worlds, write_changes
 from sim_bridge.sensors import STANDARD, Sensors, write_sensors
 from sim_bridge.stage import staging
 
@@ -43,6 +44,7 @@ class SessionOptions:
     schedule: schedule.ScheduleOptions = dataclasses.field(default_factory=schedule.ScheduleOptions)
     recorder: recorder.RecorderOptions = dataclasses.field(default_factory=recorder.RecorderOptions)
     sensors: Sensors = STANDARD
+    changes: ChangeOptions | None = STANDARD_CHANGES
 
 
 def synthesize(
@@ -68,14 +70,17 @@ def synthesize(
     if seed < 0:
         raise SynthesisError(f"seed {seed}; expected 0 or more", hint="choose another seed")
     refuse_existing(out, force=force, marker="session.toml", kind="folder")
-    room = make_scene(scene, seed)
-    stage = staging.set_stage(room, chosen.stage, rng=generator(seed, 4))
+    worlds = make_worlds(make_blueprint(scene, seed), chosen.changes, seed=seed)
+    # Tags, tripods and the robot's ways have to fit the world that is photographed and the one that is visited.
+    stage = staging.set_stage(worlds.both, chosen.stage, rng=generator(seed, 4))
+    before, after = (staging.set_in(world, stage) for world in (worlds.mapped, worlds.visited))
     with atomic_folder(out, force=force, marker="session.toml") as folder:
         write_sensors(folder / "sensors.toml", chosen.sensors)
-        _write_mapping(folder, room, chosen, seed=seed)
-        _write_photos(folder, stage, chosen, seed=seed)
-        _write_robot(folder, stage, chosen, formats, seed=seed)
-        _write_surface(folder / "truth" / "surface.ply", room)
+        write_changes(folder, chosen.changes, worlds)
+        _write_mapping(folder, worlds.mapped, chosen, seed=seed)
+        _write_photos(folder, before, chosen, seed=seed)
+        _write_robot(folder, after, chosen, formats, seed=seed)
+        _write_surface(folder / "truth" / "surface.ply", worlds.mapped)
         _write_tags(folder / "truth" / "tags.toml", stage)
         recording = recorder.RECORDINGS[formats[0]]
         layout = chosen.recorder.layout

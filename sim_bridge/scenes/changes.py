@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
@@ -11,6 +12,7 @@ from msgspec import Meta
 
 from fieldkit.errors import suggestion
 from fieldkit.frames import Pose, yaw_pose
+from fieldkit.store import read_toml, write_toml
 from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Rgb, Scene
 from sim_bridge.scenes.blueprint import FULL_UV, Blueprint, Lamp, Quad, Thing
@@ -49,7 +51,8 @@ class ChangeOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     dimmed: tuple[NotNegative, NotNegative] = (0.75, 1.1)
 
 
-CHANGES: dict[str, ChangeOptions | None] = {"standard": ChangeOptions(), "none": None}
+STANDARD_CHANGES = ChangeOptions()
+CHANGES: dict[str, ChangeOptions | None] = {"standard": STANDARD_CHANGES, "none": None}
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True):
@@ -85,20 +88,46 @@ class Worlds:
 
 
 def find_changes(name: str) -> ChangeOptions | None:
-    """Return options by name, None for no changes; raises SynthesisError for an unknown name."""
+    """Return options by name or from a TOML file, None for no changes; raises SynthesisError or StoreError."""
+    if name.endswith(".toml"):
+        return read_toml(Path(name), ChangeOptions, what="options as in a session's changes.toml")
     if name not in CHANGES:
-        raise SynthesisError(f"unknown changes {name!r}", hint=suggestion(name, list(CHANGES)))
+        raise SynthesisError(f"unknown changes {name!r}", hint=f"{suggestion(name, list(CHANGES))}, or a TOML file")
     return CHANGES[name]
+
+
+def write_changes(folder: Path, options: ChangeOptions | None, worlds: Worlds) -> None:
+    """Write a session's ``changes.toml`` (the options, none where nothing changes), and what changed as truth."""
+    if options is not None:
+        write_toml(folder / "changes.toml", options)
+    write_toml(folder / "truth" / "changes.toml", {"version": 1, "change": list(worlds.changes)})
 
 
 def make_worlds(blueprint: Blueprint, options: ChangeOptions | None, *, seed: int) -> Worlds:
     """Make and light the worlds of a session; the same blueprint, options and seed give the same worlds."""
-    mapped = lit(blueprint, rng=np.random.default_rng([seed, 90709]))
+    mapped = mapped_scene(blueprint, seed=seed)
     if options is None:
         return Worlds(mapped, mapped, mapped)
-    new = changed(blueprint, options, rng=np.random.default_rng([seed, 90717]))
+    new = _changed_by_seed(blueprint, options, seed)
     visited = lit(new.blueprint, new.light, rng=np.random.default_rng([seed, 90719]))
     return Worlds(mapped, visited, unlit(_united(blueprint, new.blueprint)), new.changes)
+
+
+def mapped_scene(blueprint: Blueprint, *, seed: int) -> Scene:
+    """Light a scene as it is mapped: `Worlds.mapped` alone."""
+    return lit(blueprint, rng=np.random.default_rng([seed, 90709]))
+
+
+def visited_scene(blueprint: Blueprint, options: ChangeOptions | None, *, seed: int) -> Scene:
+    """Light a scene as the robot visits it: `Worlds.visited` alone."""
+    if options is None:
+        return mapped_scene(blueprint, seed=seed)
+    new = _changed_by_seed(blueprint, options, seed)
+    return lit(new.blueprint, new.light, rng=np.random.default_rng([seed, 90719]))
+
+
+def _changed_by_seed(blueprint: Blueprint, options: ChangeOptions, seed: int) -> Changed:
+    return changed(blueprint, options, rng=np.random.default_rng([seed, 90717]))
 
 
 def changed(blueprint: Blueprint, options: ChangeOptions, *, rng: np.random.Generator) -> Changed:

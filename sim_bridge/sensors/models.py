@@ -197,6 +197,14 @@ def with_quality(sensors: Sensors, quality: int) -> Sensors:
     return msgspec.structs.replace(sensors, hand=hand)
 
 
+def with_lens(sensors: Sensors, name: str) -> Sensors:
+    """Return the sensors with another lens of the hand camera; raises SynthesisError for an unknown name."""
+    if name not in LENSES:
+        raise SynthesisError(f"unknown lens {name!r}", hint=suggestion(name, list(LENSES)))
+    hand = msgspec.structs.replace(sensors.hand, lens=LENSES[name])
+    return msgspec.structs.replace(sensors, hand=hand)
+
+
 def write_sensors(path: Path, sensors: Sensors) -> None:
     """Write sensors as TOML; effects that are off are left out."""
     write_toml(path, sensors)

@@ -99,6 +99,13 @@ def set_stage(scene: Scene, options: StageOptions, *, rng: np.random.Generator) 
     return stage
 
 
+def set_in(scene: Scene, stage: Stage) -> Stage:
+    """Return the stage with its tags set up in another scene, in which there must be room for them."""
+    for tag in stage.tags:
+        scene = with_tag(scene, tag)
+    return dataclasses.replace(stage, scene=scene)
+
+
 def with_tag(scene: Scene, tag: PlacedTag) -> Scene:
     """Return the scene with a tag on its board, and with a tripod's pole and foot when it belongs to a visit."""
     print_m = tag.size_m * (8 + 2 * MARGIN_CELLS) / 8
