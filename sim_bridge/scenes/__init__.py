@@ -11,13 +11,14 @@ from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Scene
 from sim_bridge.scenes.blueprint import Blueprint
 from sim_bridge.scenes.light import lit
+from sim_bridge.scenes.lobby import lobby
 from sim_bridge.scenes.office import office
 from sim_bridge.scenes.room import furnished_room
 
 __all__ = ["SCENES", "make_blueprint", "make_scene"]
 
 # Name -> generator of the scene from a seed.
-SCENES: dict[str, Callable[[int], Blueprint]] = {"room": furnished_room, "office": office}
+SCENES: dict[str, Callable[[int], Blueprint]] = {"room": furnished_room, "office": office, "lobby": lobby}
 
 
 def make_blueprint(name: str, seed: int) -> Blueprint:

@@ -34,7 +34,7 @@ from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_f
 LENGTH_M, WIDTH_M, HEIGHT_M = 14.9, 11.0, 2.7
 KITCHEN_X, CORRIDOR_Y, ROOMS_Y = 11.4, 6.2, 7.7
 _PX_PER_M = 110
-_WINDOW_POWER, _LAMP_POWER = 2.4, 3.0
+_WINDOW_POWER, _LAMP_POWER = 3.0, 4.2
 
 
 @dataclasses.dataclass(frozen=True)

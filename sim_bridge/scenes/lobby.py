@@ -1,0 +1,196 @@
+"""The lobby: a high hall with a glazed front, a reception, pillars, gates before the lifts, and a waiting room.
+
+The plan, in metres, with x to the east (0..12.4) and y to the north (0..9):
+
+    +----------------+-- lift --- lift --- lift --+   9.0
+    | waiting room   |                            |
+    +---------   ----+ o  gate gate gate gate gate|   6.3
+    |                                             |
+    | counter  o    sofas                display  |
+    |   |           sofas    o                    |
+    |                              sofa  table  sofa
+    +-------------   glazed front   --------------+   0
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fieldkit.frames import Pose, yaw_pose
+from sim_bridge.scenes import lobby_furniture as furniture
+from sim_bridge.scenes import lobby_prints as prints
+from sim_bridge.scenes import office_prints, textures
+from sim_bridge.scenes.blueprint import Blueprint, Builder
+from sim_bridge.scenes.lobby_furniture import Make
+from sim_bridge.scenes.office_furniture import hang, moved, plant, px
+from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_frame, window
+
+LENGTH_M, WIDTH_M, HEIGHT_M = 12.4, 9.0, 3.9
+WAITING_X, GATES_Y = 4.4, 6.3
+_PX_PER_M = 110
+_WINDOW_POWER, _LAMP_POWER, _SPOT_POWER = 9.0, 2.6, 1.2
+
+_SOUTH = ((0.0, 0.0), (LENGTH_M, 0.0))
+_EAST = ((LENGTH_M, 0.0), (LENGTH_M, WIDTH_M))
+_NORTH = ((LENGTH_M, WIDTH_M), (0.0, WIDTH_M))
+_WEST = ((0.0, WIDTH_M), (0.0, 0.0))
+_WAITING_SOUTH = ((0.0, GATES_Y), (WAITING_X, GATES_Y))
+_WAITING_EAST = ((WAITING_X, GATES_Y), (WAITING_X, WIDTH_M))
+_PILLARS = ((3.3, 3.1), (8.3, 3.6), (5.45, GATES_Y))
+
+
+def lobby(seed: int) -> Blueprint:
+    """Make the lobby of 12.4 x 9 x 3.9 m; the same seed gives the same lobby."""
+    rng = np.random.default_rng([seed, 90802])
+    build = Builder()
+    look = furniture.make(build, rng)
+    _shell(build, rng)
+    _lamps(build)
+    _reception(build, rng, look)
+    _gates_and_lifts(build, rng, look)
+    _seats(build, rng, look)
+    _boards(build, rng, look)
+    _waiting_room(build, rng, look)
+    bounds = (0.0, 0.0, LENGTH_M, WIDTH_M)
+    outside(build, bounds, [bounds])
+    return build.blueprint(floor_bounds=bounds)
+
+
+def _shell(build: Builder, rng: np.random.Generator) -> None:
+    size = (round(HEIGHT_M * _PX_PER_M), round(6 * _PX_PER_M))
+    long = (size[0], round(LENGTH_M * _PX_PER_M))
+    white = np.array([226, 223, 216]) + rng.normal(0, 3, 3)
+    grey = np.array(((150, 154, 158), (168, 160, 148), (146, 156, 150))[int(rng.integers(3))]) + rng.normal(0, 4, 3)
+    plain = build.texture(office_prints.paint(rng, size, base=white))
+    striped = build.texture(office_prints.stripes(rng, long, base=white - 18, px_per_m=_PX_PER_M, pitch_m=0.4))
+    clad = build.texture(prints.cladding(rng, long, base=grey, px_per_m=_PX_PER_M, panel_m=(1.2, 1.3)))
+    slatted = build.texture(prints.slats(rng, long, base=grey - 25, px_per_m=_PX_PER_M, pitch_m=0.2))
+    trim = build.plain(white - 110)
+    panes = [Opening(s, 1.9, top_m=2.9, bottom_m=0.12) for s in (4.3, 6.3, 8.3)]
+    faces = (
+        (_SOUTH, plain, None, panes),
+        (_EAST, striped, None, []),
+        (_NORTH, clad, None, []),
+        (_WEST, plain, None, []),
+    )
+    inner = ((_WAITING_SOUTH, plain, slatted, [Opening(3.3, 1.25)]), (_WAITING_EAST, plain, clad, []))
+    for line, left, right, holes in (*faces, *inner):
+        wall(build, *line, height_m=HEIGHT_M, openings=holes, left=left, right=right, trim=trim, cell_m=0.25)
+    view, rim = build.texture(prints.street(rng, (160, 128))), build.plain((74, 78, 84))
+    for hole in panes:
+        window(build, *_SOUTH, hole, power=_WINDOW_POWER, texture=view, frame=rim, samples=(2, 2))
+    floor = build.texture(prints.stone(rng, (360, 360), base=np.array([176, 172, 164]) + rng.normal(0, 4, 3)))
+    above = build.texture(office_prints.ceiling_tiles(rng, (288, 288), px_per_m=120))
+    whole = (0.0, 0.0, LENGTH_M, WIDTH_M)
+    slab(build, whole, z_m=0.0, texture=floor, up=True, cell_m=0.13, tile_m=(2.4, 2.4))
+    slab(build, whole, z_m=HEIGHT_M, texture=above, up=False, cell_m=0.6, tile_m=(2.4, 2.4))
+    mat = build.texture(prints.mat((240, 560)))
+    spot = Pose.from_components([6.3, 0.95, 0.004], Rotation.identity())
+    build.panel(spot, (2.8, 1.3), mat, cell_m=0.13, solid=False)
+    for x, y in _PILLARS:
+        furniture.pillar(build, yaw_pose([x, y, 0.0], 0.0), plain, radius_m=0.27, height_m=HEIGHT_M)
+
+
+def _lamps(build: Builder) -> None:
+    turn = Rotation.from_euler("x", np.pi)
+    for x in (np.arange(6) + 0.5) * LENGTH_M / 6:
+        for y in (1.1, 3.35, 5.6, 7.85):
+            under = Pose.from_components([x, y, HEIGHT_M - 0.01], turn)
+            build.lamp(under, (0.6, 0.6), power=_LAMP_POWER, samples=(1, 1))
+    for y in (2.7, 3.65, 4.6):
+        under = Pose.from_components([2.3, y, HEIGHT_M - 0.02], turn)
+        build.lamp(under, (0.15, 0.15), power=_SPOT_POWER, group="spot", samples=(1, 1))
+
+
+def _hang(
+    build: Builder,
+    line: tuple[tuple[float, float], tuple[float, float]],
+    at_m: float,
+    size_m: tuple[float, float],
+    image: textures.Rgb,
+    *,
+    up_m: float = 1.5,
+    name: str = "poster",
+) -> None:
+    """Hang a picture on the left face of a wall, its middle up_m above the floor."""
+    hang(build, on_wall(wall_frame(*line, at_m), 0.0, up_m, off_m=0.0), size_m, image, name=name)
+
+
+def _reception(build: Builder, rng: np.random.Generator, look: Make) -> None:
+    place = yaw_pose([2.35, 3.65, 0.0], -np.pi / 2)
+    furniture.counter(build, rng, look, place, length_m=2.7)
+    for x in (-0.7, 0.75):
+        spot = moved(place, x + float(rng.normal(0, 0.1)), -0.75, yaw_rad=np.pi + float(rng.normal(0, 0.4)))
+        furniture.armchair(build, look, spot)
+    size = (2.2, 0.6)
+    image = prints.logo(rng, px(size, px_per_m=250), base=(226, 223, 216))
+    _hang(build, _WEST, WIDTH_M - 3.6, size, image, up_m=2.1, name="logo")
+    size = (0.5, 0.7)
+    _hang(build, _WEST, WIDTH_M - 5.6, size, textures.page(rng, px(size)), up_m=1.45)
+
+
+def _gates_and_lifts(build: Builder, rng: np.random.Generator, look: Make) -> None:
+    for x in (6.6, 8.0, 9.4, 10.8, 12.2):
+        furniture.turnstile(build, look, yaw_pose([x, GATES_Y, 0.0], 0.0))
+    for x0, x1 in itertools.pairwise((WAITING_X + 0.06, 5.2, 5.7, 6.48)):
+        if x0 != 5.2:
+            furniture.fence(build, look, yaw_pose([(x0 + x1) / 2, GATES_Y, 0.0], 0.0), length_m=x1 - x0)
+    for x in (6.4, 8.4, 10.4):
+        furniture.lift(build, look, wall_frame(*_NORTH, LENGTH_M - x))
+    size = (0.8, 1.1)
+    _hang(build, _NORTH, LENGTH_M - 11.75, size, prints.directory(rng, px(size)), up_m=1.55, name="directory")
+    size = (0.7, 0.95)
+    back = wall_frame(*_WAITING_EAST, 1.5, side="right")
+    hang(build, on_wall(back, 0.0, 1.45, off_m=0.0), size, textures.chart(rng, px(size)))
+
+
+def _seats(build: Builder, rng: np.random.Generator, look: Make) -> None:
+    """Add equal sofas: two back to back in the middle, two about a table in the corner; plants."""
+    middle = yaw_pose([6.0, 3.6, 0.0], 0.0)
+    for yaw in (0.0, np.pi):
+        furniture.sofa(build, look, moved(moved(middle, yaw_rad=yaw), 0.0, -0.43))
+    corner = yaw_pose([10.5, 2.0, 0.0], np.pi / 2)
+    furniture.low_table(build, rng, look, moved(corner, 0.0, 0.1, yaw_rad=float(rng.normal(0, 0.08))))
+    for yaw, off in ((0.0, 1.45), (np.pi, 1.42)):
+        furniture.sofa(build, look, moved(moved(corner, yaw_rad=yaw), 0.0, off))
+    furniture.armchair(build, look, yaw_pose([10.35, 0.5, 0.0], np.pi + float(rng.normal(0, 0.15))))
+    for x, y in ((0.45, 0.45), (12.0, 3.5), (12.0, 0.45)):
+        plant(build, rng, yaw_pose([x, y, 0.0], float(rng.uniform(0, np.pi))), height_m=float(rng.uniform(1.3, 1.7)))
+
+
+def _boards(build: Builder, rng: np.random.Generator, look: Make) -> None:
+    """Add free-standing boards, a rack, an information screen, and pictures on the large walls."""
+    spots = ((10.2, 3.95, 2.6), (7.3, 1.3, 1.5), (3.1, 0.55, 0.2))
+    for i, (x, y, yaw) in enumerate(spots):
+        kinds = [textures.PICTURES[str(k)] for k in rng.choice(list(textures.PICTURES), 2)]
+        front = kinds[0](rng, px((0.94, 1.34), px_per_m=320))
+        back = kinds[1](rng, px((0.94, 1.34), px_per_m=320)) if i == 1 else None
+        spot = yaw_pose([x, y, 0.0], yaw + float(rng.normal(0, 0.15)))
+        furniture.display(build, look, spot, front, back)
+    furniture.rack(build, rng, look, wall_frame(*_SOUTH, 1.9))
+    furniture.kiosk(build, rng, look, yaw_pose([4.3, 5.95, 0.0], np.pi))
+    size = (1.9, 1.3)
+    _hang(build, _EAST, 4.9, size, prints.painting(rng, px(size, px_per_m=300)), up_m=1.75, name="painting")
+    size = (0.6, 0.85)
+    _hang(build, _SOUTH, 10.9, size, textures.photo(rng, px(size)), up_m=1.5)
+    size = (0.5, 0.7)
+    hang(
+        build,
+        on_wall(wall_frame(*_WAITING_SOUTH, 1.2, side="right"), 0.0, 1.5, off_m=0.0),
+        size,
+        textures.page(rng, px(size)),
+    )
+
+
+def _waiting_room(build: Builder, rng: np.random.Generator, look: Make) -> None:
+    furniture.lockers(build, wall_frame(*_NORTH, LENGTH_M - 1.2), columns=6)
+    for y in (6.95, 7.75):
+        furniture.armchair(build, look, yaw_pose([0.48, y, 0.0], np.pi / 2 + float(rng.normal(0, 0.1))))
+    size = (1.1, 0.75)
+    _hang(build, _WEST, WIDTH_M - 7.4, size, office_prints.cork(rng, px(size)), up_m=1.5, name="notices")
+    size = (0.65, 0.9)
+    _hang(build, _WAITING_EAST, 1.6, size, textures.shapes(rng, px(size)), up_m=1.5)
+    furniture.kiosk(build, rng, look, yaw_pose([3.4, 8.5, 0.0], np.pi + 0.2))
