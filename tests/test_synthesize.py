@@ -6,12 +6,16 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from fieldkit.bags import open_recording
+from fieldkit.bags import LAYOUTS, BagFormat, inspect_recording, open_recording
+from fieldkit.bags.content import collect, stamp_ns
+from fieldkit.bags.files import BagFile
+from fieldkit.cameras import camera_from_info
 from fieldkit.errors import StoreError
 from fieldkit.frames import Pose, Trajectory, pose_error
 from fieldkit.store import read_camera, read_photos, read_rig, read_session, read_tags, read_tum
@@ -22,7 +26,7 @@ from sim_bridge.errors import SynthesisError
 from sim_bridge.mapping import mapper, photographer
 from sim_bridge.mesh import Scene
 from sim_bridge.recording import recorder, schedule
-from sim_bridge.scenes import make_scene
+from sim_bridge.scenes import SCENES, make_scene
 from sim_bridge.stage import staging
 from sim_bridge.synthesize import SessionOptions, generator
 
@@ -131,12 +135,12 @@ def test_the_full_photo_camera_has_twelve_megapixels_and_distortion() -> None:
     assert not camera.is_pinhole
 
 
-def corners_agree(image: np.ndarray, expected_px: np.ndarray) -> float:
-    """Distance in pixels between projected tag corners and the sub-pixel corners that OpenCV finds next to them."""
+def corner_shifts(image: np.ndarray, expected_px: np.ndarray) -> np.ndarray:
+    """Shifts (4, 2) in pixels from projected tag corners to the sub-pixel corners that OpenCV finds next to them."""
     start = (expected_px - 0.5).astype(np.float32).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
     found = cv2.cornerSubPix(image, start.copy(), (3, 3), (-1, -1), criteria)
-    return float(np.median(np.linalg.norm(found - start, axis=2)))
+    return np.asarray(found - start).reshape(-1, 2)
 
 
 def test_every_photo_shows_its_tag_where_the_truth_says(session: Path) -> None:
@@ -149,7 +153,7 @@ def test_every_photo_shows_its_tag_where_the_truth_says(session: Path) -> None:
         pixels, inside = camera.project(poses[photo.file].inv().apply(corners))
         image = picture(session / "photos" / photo.file, flags=cv2.IMREAD_GRAYSCALE)
         assert inside.all()
-        assert corners_agree(image, pixels) < 0.5
+        assert np.median(np.linalg.norm(corner_shifts(image, pixels), axis=1)) < 0.5
 
 
 def test_every_start_and_truth_image_shows_its_tag_where_the_truth_says(session: Path, recording: Recording) -> None:
@@ -166,7 +170,10 @@ def test_every_start_and_truth_image_shows_its_tag_where_the_truth_says(session:
         in_cam = truth[str(frame.t_ns)].inv().apply(tag.map_from_tag.apply(tag_corners(tag.size_m)))
         pixels, inside = frame.camera.project(in_cam)
         assert inside.all()
-        assert corners_agree(cv2.cvtColor(frame.read(), cv2.COLOR_RGB2GRAY), pixels) < 0.5
+        shifts = corner_shifts(cv2.cvtColor(frame.read(), cv2.COLOR_RGB2GRAY), pixels)
+        # Motion blur pulls the corners of a tag inwards, but not to one side.
+        assert np.linalg.norm(shifts.mean(axis=0)) < 0.4
+        assert np.median(np.linalg.norm(shifts, axis=1)) < (1.5 if visit_id is None else 0.7)
 
 
 def kinds(visit: Visit, kind: str) -> int:
@@ -199,14 +206,58 @@ def test_tripod_tags_are_seen_near_and_at_a_slant(session: Path, recording: Reco
             assert 19.0 < np.degrees(np.arctan2(np.hypot(x, y), z)) < 46.0
 
 
-def test_kinematics_at_the_stamp_give_the_true_camera_pose(session: Path, recording: Recording) -> None:
-    body, truth = body_track(session), truth_of(session)
+def test_kinematics_at_the_stamp_give_almost_the_true_camera_pose(session: Path, recording: Recording) -> None:
+    body, truth, errors = body_track(session), truth_of(session), []
     for view in (v for visit in recording.visits for v in visit.views):
         frame = view.frame
         assert frame.body_from_cam is not None
-        distance, angle = pose_error(body.at(frame.t_ns) * frame.body_from_cam, truth[str(frame.t_ns)])
-        assert distance < 0.003
-        assert np.degrees(angle) < 0.15
+        errors.append(pose_error(body.at(frame.t_ns) * frame.body_from_cam, truth[str(frame.t_ns)]))
+    distance, angle = np.array(errors).T
+    assert 0.0003 < np.median(distance) < distance.max() < 0.008
+    assert 0.03 < np.degrees(np.median(angle)) < np.degrees(angle.max()) < 0.6
+
+
+def messages(path: Path, topic: str) -> list[Any]:
+    return [message.value for message in BagFile(path).messages([topic])]
+
+
+def test_depth_beside_every_image_is_that_of_the_scene(
+    session: Path, recording: Recording, stage: staging.Stage
+) -> None:
+    layout, body = LAYOUTS["generic"], body_track(session)
+    sent = messages(session / "robot.mcap", layout.depth_compressed)
+    tf = collect(BagFile(session / "robot.mcap"), layout).tf
+    assert [stamp_ns(message.header) for message in sent] == [frame.t_ns for frame in recording.frames]
+    for message in sent[3::9]:
+        t_ns = stamp_ns(message.header)
+        assert (message.header.frame_id, message.format) == (layout.depth_frame, "16UC1; png compressed")
+        depth = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED)[::8, ::8] / 1000.0
+        rows, columns = np.indices(depth.shape) * 8 + 0.5
+        rays = robot.DEPTH_CAMERA.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
+        world_from_cam = body.at(t_ns) * tf.lookup(layout.body_frame, layout.depth_frame, t_ns=t_ns)
+        exact = stage.scene.intersect(world_from_cam.translation, world_from_cam.rotation.apply(rays))
+        exact = (exact / np.linalg.norm(rays, axis=1)).reshape(depth.shape)
+        seen = depth > 0
+        assert seen.mean() > 0.3
+        assert np.median(np.abs(depth[seen] / exact[seen] - 1.0)) < 0.02
+
+
+def test_the_depth_camera_has_its_own_camera_info(session: Path) -> None:
+    layout = LAYOUTS["generic"]
+    infos = messages(session / "robot.mcap", layout.depth_info)
+    found = {camera_from_info(i.width, i.height, i.k, i.d, distortion_model=i.distortion_model) for i in infos}
+    assert [(c.width, c.height, c.model) for c in found] == [(224, 171, "PINHOLE")]
+    assert next(iter(found)).params == pytest.approx(robot.DEPTH_CAMERA.params)
+
+
+def test_joint_states_are_the_joints_of_tf(session: Path) -> None:
+    layout = LAYOUTS["generic"]
+    bag = BagFile(session / "robot.mcap")
+    content = collect(bag, layout)
+    for t_ns, angles in content.joints[::50]:
+        arm = robot.joints([angles[name] for name in layout.arm_joints])
+        in_body = content.tf.lookup(layout.body_frame, layout.arm_frames[-1], t_ns=t_ns)
+        assert pose_error(in_body, robot.body_from_wrist(arm)) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
 def test_image_stamps_lie_between_the_samples_of_tf_and_odometry(session: Path, recording: Recording) -> None:
@@ -223,6 +274,73 @@ def test_odometry_drifts_while_the_robot_drives(session: Path, recording: Record
         believed = recording.odometry.at(times[0]).inv() * recording.odometry.at(times[1])
         distance, _ = pose_error(believed, true)
         assert 0.001 < distance < 0.3 * np.linalg.norm(true.translation)
+
+
+@pytest.fixture(scope="module")
+def sensed(stage: staging.Stage) -> dict[str, recorder.Sensed]:
+    """The shortest visit, as the robot of every layout senses it."""
+    one = dataclasses.replace(stage, waypoints=stage.waypoints[:1])
+    plan = schedule.plan_session(one, LEAST.schedule, stage_options=LEAST.stage, rng=generator(SEED, 7))
+    plan = dataclasses.replace(plan, shots=plan.shots[:6])
+    return {
+        name: recorder.sense(one, plan, recorder.RecorderOptions(layout=name), rng=generator(SEED, 8))
+        for name in LAYOUTS
+    }
+
+
+@pytest.mark.parametrize("format", list(recorder.RECORDINGS))
+def test_every_layout_in_every_format_is_read_as_the_same_session(
+    tmp_path: Path, sensed: dict[str, recorder.Sensed], format: BagFormat
+) -> None:
+    opened = {}
+    for name in LAYOUTS:
+        recorder.write_recording(
+            tmp_path / name / recorder.RECORDINGS[format], sensed[name], format=format, layout=name
+        )
+        opened[name] = open_recording(tmp_path / name / recorder.RECORDINGS[format])
+    generic = opened["generic"]
+    for name, other in opened.items():
+        assert (other.layout, other.warnings) == (name, ())
+        assert (other.starts, [v.id for v in other.visits]) == (generic.starts, ["w01"])
+        for a, b in zip(generic.frames, other.frames, strict=True):
+            assert (a.t_ns, a.camera) == (b.t_ns, b.camera)
+            assert np.array_equal(a.read(), b.read())
+            assert a.body_from_cam is not None
+            assert b.body_from_cam is not None
+            # Encoder noise, and a wrist that one driver gives as one transform and the other as six.
+            assert pose_error(a.body_from_cam, b.body_from_cam)[0] < 0.005
+
+
+@pytest.mark.parametrize("layout", list(LAYOUTS))
+def test_inspect_counts_joints_and_depth_of_every_layout(
+    tmp_path: Path, sensed: dict[str, recorder.Sensed], layout: str
+) -> None:
+    format, said = recorder.own_format(layout), sensed[layout]
+    path = tmp_path / recorder.RECORDINGS[format]
+    recorder.write_recording(path, said, format=format, layout=layout)
+    found = inspect_recording(path)
+    assert (found["layout"], found["missing"], found["warnings"]) == (layout, [], [])
+    assert (found["depth"]["count"], found["depth"]["camera_info"]) == (len(said.images), len(said.images))
+    assert found["joint_states"]["count"] == found["odometry"]["count"] == len(said.states)
+    assert len(found["joint_states"]["names"]) == 6
+    rate = len(said.states) / found["duration_s"]
+    assert rate == pytest.approx(recorder.STATE_HZ[layout], rel=0.05)
+
+
+def test_names_are_those_of_the_real_drivers() -> None:
+    ros1, ros2 = LAYOUTS["spot_ros1"], LAYOUTS["spot_ros2"].named("rex")
+    assert (ros1.arm_joints[0], ros1.arm_frames) == ("arm_joint1", ("link_wr1",))
+    assert (ros1.depth, ros1.depth_frame, ros1.odom_frame) == ("/spot/depth/hand/image", "hand_depth_sensor", "vision")
+    assert (ros2.arm_joints[5], ros2.arm_frames[5]) == ("rex/arm_wr1", "rex/arm_link_wr1")
+    assert (ros2.depth, ros2.depth_frame) == ("/rex/depth/hand/image", "rex/hand_depth_sensor")
+
+
+def test_a_layout_s_own_format_is_that_of_its_driver() -> None:
+    assert {name: recorder.own_format(name) for name in LAYOUTS} == {
+        "generic": "mcap",
+        "spot_ros1": "ros1",
+        "spot_ros2": "mcap",
+    }
 
 
 def test_all_formats_hold_the_same_session(session: Path, recording: Recording) -> None:
@@ -311,7 +429,8 @@ def test_force_does_not_replace_a_folder_that_is_no_session(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--scene", "rom"], "sim-bridge: unknown scene 'rom'; did you mean 'room'? known: room"),
+        (["--scene", "rom"], f"sim-bridge: unknown scene 'rom'; did you mean 'room'? known: {', '.join(SCENES)}"),
+        (["--layout", "nao"], f"sim-bridge: unknown layout 'nao'; known: {', '.join(LAYOUTS)}"),
         (["--waypoints", "0"], "sim-bridge: --waypoints 0: expected 1..20; choose another number"),
         (["--seed", "-3"], "sim-bridge: seed -3; expected 0 or more; choose another seed"),
     ],
