@@ -14,7 +14,9 @@ The plan, in metres, with x to the east (0..12.4) and y to the north (0..9):
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,6 +35,8 @@ WAITING_X, GATES_Y = 4.4, 6.3
 _PX_PER_M = 110
 _WINDOW_POWER, _LAMP_POWER, _SPOT_POWER = 9.0, 2.6, 1.2
 
+Line = tuple[tuple[float, float], tuple[float, float]]
+
 _SOUTH = ((0.0, 0.0), (LENGTH_M, 0.0))
 _EAST = ((LENGTH_M, 0.0), (LENGTH_M, WIDTH_M))
 _NORTH = ((LENGTH_M, WIDTH_M), (0.0, WIDTH_M))
@@ -47,7 +51,8 @@ def lobby(seed: int) -> Blueprint:
     rng = np.random.default_rng([seed, 90802])
     build = Builder()
     look = furniture.make(build, rng)
-    _shell(build, rng)
+    _walls(build, rng)
+    _floor(build, rng)
     _lamps(build)
     _reception(build, rng, look)
     _gates_and_lifts(build, rng, look)
@@ -59,7 +64,17 @@ def lobby(seed: int) -> Blueprint:
     return build.blueprint(floor_bounds=bounds)
 
 
-def _shell(build: Builder, rng: np.random.Generator) -> None:
+@dataclasses.dataclass(frozen=True)
+class _Side:
+    """A wall in plan, the textures of its faces, and its openings."""
+
+    line: Line
+    left: int
+    right: int | None
+    openings: Sequence[Opening] = ()
+
+
+def _walls(build: Builder, rng: np.random.Generator) -> None:
     size = (round(HEIGHT_M * _PX_PER_M), round(6 * _PX_PER_M))
     long = (size[0], round(LENGTH_M * _PX_PER_M))
     white = np.array([226, 223, 216]) + rng.normal(0, 3, 3)
@@ -70,18 +85,18 @@ def _shell(build: Builder, rng: np.random.Generator) -> None:
     slatted = build.texture(prints.slats(rng, long, base=grey - 25, px_per_m=_PX_PER_M, pitch_m=0.2))
     trim = build.plain(white - 110)
     panes = [Opening(s, 1.9, top_m=2.9, bottom_m=0.12) for s in (4.3, 6.3, 8.3)]
-    faces = (
-        (_SOUTH, plain, None, panes),
-        (_EAST, striped, None, []),
-        (_NORTH, clad, None, []),
-        (_WEST, plain, None, []),
-    )
-    inner = ((_WAITING_SOUTH, plain, slatted, [Opening(3.3, 1.25)]), (_WAITING_EAST, plain, clad, []))
-    for line, left, right, holes in (*faces, *inner):
-        wall(build, *line, height_m=HEIGHT_M, openings=holes, left=left, right=right, trim=trim, cell_m=0.25)
+    sides = [_Side(_SOUTH, plain, None, panes), _Side(_EAST, striped, None), _Side(_NORTH, clad, None)]
+    sides += [_Side(_WEST, plain, None), _Side(_WAITING_EAST, plain, clad)]
+    for side in (*sides, _Side(_WAITING_SOUTH, plain, slatted, [Opening(3.3, 1.25)])):
+        wall(build, *side.line, height_m=HEIGHT_M, openings=side.openings, left=side.left, right=side.right, trim=trim)
     view, rim = build.texture(prints.street(rng, (160, 128))), build.plain((74, 78, 84))
     for hole in panes:
         window(build, *_SOUTH, hole, power=_WINDOW_POWER, texture=view, frame=rim, samples=(2, 2))
+    for x, y in _PILLARS:
+        furniture.pillar(build, yaw_pose([x, y, 0.0], 0.0), plain, radius_m=0.27, height_m=HEIGHT_M)
+
+
+def _floor(build: Builder, rng: np.random.Generator) -> None:
     floor = build.texture(prints.stone(rng, (360, 360), base=np.array([176, 172, 164]) + rng.normal(0, 4, 3)))
     above = build.texture(office_prints.ceiling_tiles(rng, (288, 288), px_per_m=120))
     whole = (0.0, 0.0, LENGTH_M, WIDTH_M)
@@ -90,8 +105,6 @@ def _shell(build: Builder, rng: np.random.Generator) -> None:
     mat = build.texture(prints.mat((240, 560)))
     spot = Pose.from_components([6.3, 0.95, 0.004], Rotation.identity())
     build.panel(spot, (2.8, 1.3), mat, cell_m=0.13, solid=False)
-    for x, y in _PILLARS:
-        furniture.pillar(build, yaw_pose([x, y, 0.0], 0.0), plain, radius_m=0.27, height_m=HEIGHT_M)
 
 
 def _lamps(build: Builder) -> None:
@@ -107,7 +120,7 @@ def _lamps(build: Builder) -> None:
 
 def _hang(
     build: Builder,
-    line: tuple[tuple[float, float], tuple[float, float]],
+    line: Line,
     at_m: float,
     size_m: tuple[float, float],
     image: textures.Rgb,

@@ -75,7 +75,7 @@ def armchair(build: Builder, look: Make, place: Pose) -> None:
         build.box(place, [0.0, 0.27, 0.6], [0.7, 0.13, 0.36], look.cloth, cell_m=0.2)
         for side in (-1, 1):
             build.box(place, [side * 0.3, -0.06, 0.5], [0.1, 0.53, 0.16], look.cloth)
-            build.box(place, [side * 0.28, 0.0, 0.06], [0.04, 0.5, 0.13], look.dark)
+            build.box(place, [side * 0.28, 0.0, 0.06], [0.04, 0.5, 0.119], look.dark)
         build.block(place, (0.72, 0.7))
 
 

@@ -188,8 +188,8 @@ def _open_plan(build: Builder, rng: np.random.Generator, look: Style) -> None:
         if i in noted:
             outwards = moved(place, yaw_rad=float(rng.choice([-np.pi / 2, np.pi / 2])))
             size = (0.6, 0.45)
-            at = on_wall(moved(outwards, y=1.656), float(rng.uniform(-0.4, 0.4)), 1.05, off_m=0.0)
-            hang(build, at, size, prints.cork(rng, px(size)), name="notices")
+            end = on_wall(moved(outwards, y=1.656), float(rng.uniform(-0.4, 0.4)), 1.05, off_m=0.0)
+            hang(build, end, size, prints.cork(rng, px(size)), name="notices")
     for i, x in enumerate(np.arange(3.6, 8.2, 0.9)):
         tall = i in (0, 1, 4)
         furniture.cupboard(build, look, FRONT.right(float(x)), height_m=2.0 if tall else 1.1)

@@ -249,13 +249,13 @@ def plant(build: Builder, rng: np.random.Generator, place: Pose, *, height_m: fl
     with build.thing("plant", place):
         build.box(place, [0.0, 0.0, 0.17], [0.34, 0.34, 0.34], pot)
         for _ in range(26):
-            yaw, lean = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.1, 0.75))
+            yaw, lean = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.05, 0.36))
             length = (height_m - 0.34) * float(rng.uniform(0.55, 1.0))
             turn = Rotation.from_euler("ZX", [yaw, -lean]) * Rotation.from_euler("x", np.pi / 2)
             middle = np.array([0.0, 0.0, 0.33]) + turn.apply([0.0, length / 2, 0.0])
             leaf = place * Pose.from_components(middle, turn)
             build.panel(leaf, (0.07, length), greens[int(rng.integers(3))], solid=False)
-        build.block(place, (0.42, 0.42))
+        build.block(place, (0.62, 0.62))
 
 
 def bin_(build: Builder, place: Pose) -> None:
