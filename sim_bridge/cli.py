@@ -100,6 +100,7 @@ def dataset(
     views: int = 50,
     workers: int = 2,
     sensors: str = "standard",
+    changes: str = "standard",
     repeats: int = 0,
     repeat_share: float = 0.1,
     force: bool = False,
@@ -116,13 +117,14 @@ def dataset(
         views: directions per place, besides the stowed and the forward view
         workers: processes; their number does not change the result
         sensors: standard, ideal, or a sensors.toml
+        changes: what changes between mapping and robot: standard, none, or a changes.toml
         repeats: further localizations with new noise, of a share of the views
         repeat_share: share of the views that are localized again
         force: make the views again where settings differ; maps that still fit are kept
     """
     from sim_bridge.dataset import DatasetOptions, make_scenes
 
-    options = DatasetOptions(seed, waypoints, views, sensors, repeats, repeat_share)
+    options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share)
     made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())
     for row in made:
         again = "" if not row.repeats else f", {row.repeats} repeats: {100 * row.flipped:.1f} % change the label"

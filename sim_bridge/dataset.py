@@ -33,7 +33,7 @@ from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
 from sim_bridge.scenes import SCENES, make_blueprint
 from sim_bridge.scenes.blueprint import Blueprint
-from sim_bridge.scenes.light import lit
+from sim_bridge.scenes.changes import STANDARD_CHANGES, ChangeOptions, find_changes, mapped_scene, visited_scene
 from sim_bridge.sensors import STANDARD, Motion, Sensors, bent, encode, expose, load_sensors
 from sim_bridge.stage.lookouts import Lookout, LookoutOptions, find_lookouts
 
@@ -72,6 +72,7 @@ class SceneOptions:
     lookouts: LookoutOptions = dataclasses.field(default_factory=LookoutOptions)
     prior: PriorNoise = dataclasses.field(default_factory=PriorNoise)
     sensors: Sensors = STANDARD
+    changes: ChangeOptions | None = STANDARD_CHANGES
     kinematics: robot.KinematicOptions = dataclasses.field(default_factory=robot.KinematicOptions)
     tremor_deg_s: float = 1.2
 
@@ -94,21 +95,32 @@ class SceneSource:
         return make_blueprint(self.name, self.options.seed)
 
     @functools.cached_property
+    def _scene(self) -> Scene:
+        return visited_scene(self._blueprint, self.options.changes, seed=self.options.seed)
+
+    @functools.cached_property
+    def _lookouts(self) -> tuple[Lookout, ...]:
+        return find_lookouts(self._scene, self.options.lookouts, rng=_generator(self.options.seed, 21))
+
+    @functools.cached_property
     def mapping_key(self) -> str:
         """Digest of the scene and of all that its mapping depends on."""
         o = self.options
-        mapping = o.sensors.mapping, o.sensors.mapping_depth
-        return digest(blueprint_digest(self._blueprint), repr((MAPPING_VERSION, o.seed, o.walk)), repr(mapping))
+        sensors = (o.sensors.mapping, o.sensors.mapping_depth)
+        return digest(blueprint_digest(self._blueprint), repr((MAPPING_VERSION, o.seed, o.walk, sensors)))
 
     @functools.cached_property
     def views_key(self) -> str:
-        """Digest of all that waypoints and images depend on."""
-        return digest(self.mapping_key, repr((VIEWS_VERSION, self.options)))
+        """Digest of the changed scene, of the places and directions, and of all else that images depend on."""
+        o = self.options
+        arms = [[arm for *_, arm in lookout.arms] for lookout in self._lookouts]
+        bodies = [lookout.world_from_body.as_matrix().tobytes() for lookout in self._lookouts]
+        return digest(scene_digest(self._scene), repr((VIEWS_VERSION, o, arms)), *bodies)
 
     def write_mapping(self, folder: Path) -> Mapping[str, Pose]:
         """Write the mapping walk through the scene as it was; return world_from_cam by image name."""
         options, sensors, seed = self.options.walk, self.options.sensors, self.options.seed
-        scene = lit(self._blueprint, rng=np.random.default_rng([seed, 90709]))
+        scene = mapped_scene(self._blueprint, seed=seed)
         stations = mapper.walk(scene, options, rng=_generator(seed, 1))
         write_rig(folder / "rig.toml", mapper.hololens_rig(sensors.mapping))
         write_tum(folder / "slam_poses.txt", [(s.frame, s.slam_from_rig) for s in stations])
@@ -121,17 +133,12 @@ class SceneSource:
         return true
 
     @functools.cached_property
-    def _scene(self) -> Scene:
-        return lit(self._blueprint, rng=np.random.default_rng([self.options.seed, 90709]))
-
-    @functools.cached_property
     def _arm(self) -> robot.Kinematics:
         return robot.assembled(self.options.kinematics, rng=_generator(self.options.seed, 25))
 
     def waypoints(self) -> Sequence[SourceWaypoint]:
         """Return the waypoints of a round trip through the scene as it has become."""
-        found = find_lookouts(self._scene, self.options.lookouts, rng=_generator(self.options.seed, 21))
-        return tuple(self._waypoint(lookout, number) for number, lookout in enumerate(found))
+        return tuple(self._waypoint(lookout, number) for number, lookout in enumerate(self._lookouts))
 
     def _waypoint(self, lookout: Lookout, number: int) -> SourceWaypoint:
         sigmas = self.options.prior.sigmas
@@ -168,12 +175,13 @@ class SceneSource:
 
 @dataclasses.dataclass(frozen=True)
 class DatasetOptions:
-    """What is asked for of every scene: places, directions, sensors by name or file, and repeated localizations."""
+    """What is asked for of every scene: places, directions, sensors and changes by name or file, and repeats."""
 
     seed: int = 0
     waypoints: int = 100
     views: int = 50
     sensors: str = "standard"
+    changes: str = "standard"
     repeats: int = 0
     repeat_share: float = 0.1
 
@@ -206,6 +214,7 @@ def make_scenes(
         seed=options.seed,
         lookouts=LookoutOptions(count=options.waypoints, views=options.views),
         sensors=load_sensors(options.sensors),
+        changes=find_changes(options.changes),
     )
     rules = DatasetRules(repeats=options.repeats, repeat_share=options.repeat_share)
     make_dataset(
@@ -235,6 +244,13 @@ def blueprint_digest(blueprint: Blueprint) -> str:
     for lamp in blueprint.lamps:
         parts += [lamp.points.tobytes(), np.asarray(lamp.normal).tobytes(), repr((lamp.power, lamp.group))]
     return digest(*parts)
+
+
+def scene_digest(scene: Scene) -> str:
+    """Return the digest of everything that is seen of a scene, or stands in the way."""
+    arrays = (scene.vertices, scene.faces, scene.uv, scene.texture, scene.closed, scene.shade, scene.blocks)
+    parts = [np.ascontiguousarray(a).tobytes() for a in (*arrays, *scene.textures)]
+    return digest(repr([a.shape for a in scene.textures]), *parts)
 
 
 def _decoded(jpeg: bytes) -> Image:

@@ -64,6 +64,7 @@ class _Lane:
     pipe: connection.Connection
     scene: _Scene | None = None
     busy: str = ""
+    making: bool = False
 
 
 def make_dataset(
@@ -210,7 +211,6 @@ class _Foreman:
         self._waiting = list(scenes)
         self._begin = time.monotonic()
         self._images = self._made = 0
-        self._first_made: float | None = None
 
     def run(self) -> None:
         """Work until every shard of every scene is there."""
@@ -242,7 +242,7 @@ class _Foreman:
             scene = max(left, key=lambda s: len(s.todo))
         lane.scene = scene
         waypoint = scene.todo.pop(0)
-        lane.busy = f"{scene.name}/{waypoint}"
+        lane.busy, lane.making = f"{scene.name}/{waypoint}", True
         self._send(lane, worker.Make(scene.source, waypoint))
 
     def _send(self, lane: _Lane, request: worker.Open | worker.Make) -> None:
@@ -271,7 +271,7 @@ class _Foreman:
             case worker.Made(images):
                 self._images += images
                 self._made += 1
-        lane.busy = ""
+        lane.busy, lane.making = "", False
 
     def _died(self, lane: _Lane) -> DatasetError:
         lane.process.join(5.0)
@@ -284,11 +284,8 @@ class _Foreman:
         if self._progress is None:
             return
         now = time.monotonic()
-        if self._first_made is None and any(lane.busy and "/" in lane.busy for lane in self._lanes):
-            self._first_made = now
         opened = [s for s in self._scenes if s.opened]
-        running = sum(lane.scene is not None and "/" in lane.busy for lane in self._lanes)
-        left = sum(len(s.todo) for s in opened) + running
+        left = sum(len(s.todo) for s in opened) + sum(lane.making for lane in self._lanes)
         total = sum(s.total for s in opened)
         # Scenes that are not open yet are taken to be as large as the others.
         closed = len(self._scenes) - len(opened)

@@ -23,13 +23,13 @@ from fieldkit.frames import pose, position_quaternion
 from fieldkit.store import digest
 from fieldkit.store.datasets import (
     MAPS_FOLDER,
-    SCENE_FILE,
     DatasetRules,
     GaugeFile,
     SceneFile,
     gauge_path,
     read_gauge,
     read_scene,
+    scene_path,
     shard_path,
     write_gauge,
     write_scene,
@@ -131,22 +131,22 @@ class Desk:
         name = self._source.name
         tell(f"{name}: scene", 0, 1)
         self._key = views_key(self._source, rules)
-        folder = out / MAPS_FOLDER / f"{name}-{map_key(self._source, rules)[:16]}.map"
-        gauge = build_scene_map(self._source, folder, rules, tell)
-        tell(f"{name}: waypoints", 0, 1)
         self._waypoints = {w.id: w for w in self._source.waypoints()}
+        key = map_key(self._source, rules)
+        folder = out / MAPS_FOLDER / f"{name}-{key[:16]}.map"
+        # Asked before the map is made, which takes minutes.
+        _refuse_other(out, name, mapping_key=key, views_key=self._key)
+        gauge = build_scene_map(self._source, folder, rules, tell)
         scene_map = maps.load_map(folder)
         self._studio = Studio(self._source, scene_map, gauge, rules)
-        entry = SceneFile(
-            version=1,
-            name=name,
-            mapping_key=map_key(self._source, rules),
-            views_key=self._key,
-            map=folder.name,
-            map_digest=scene_map.digest,
-            waypoints=tuple(self._waypoints),
-        )
-        _keep_or_write(out, entry)
+        entry = SceneFile(1, name, key, self._key, folder.name, scene_map.digest, tuple(self._waypoints))
+        if not scene_path(out, name).is_file():
+            write_scene(out, entry)
+        elif read_scene(out, name) != entry:
+            raise DatasetError(
+                f"{folder}: was made again and is another map now; expected the one that {out / name} was localized in",
+                hint="give --force to make the views again",
+            )
 
     def opened(self) -> Opened:
         """Return the waypoints, and which of them are done."""
@@ -162,18 +162,15 @@ class Desk:
         return Made(len(shard.view_ids) + len(shard.repeat_view))
 
 
-def _keep_or_write(out: Path, entry: SceneFile) -> None:
-    """Write scene.toml; raises DatasetError when the scene's shards were made from something else."""
-    if not (out / entry.name / SCENE_FILE).is_file():
-        write_scene(out, entry)
+def _refuse_other(out: Path, name: str, **keys: str) -> None:
+    """Raise DatasetError when the shards of a scene were made from another state of it."""
+    if not scene_path(out, name).is_file():
         return
-    before = read_scene(out, entry.name)
-    if before != entry:
-        changed = next(f for f in SceneFile.__struct_fields__ if getattr(before, f) != getattr(entry, f))
+    entry = read_scene(out, name)
+    if any(getattr(entry, which) != key for which, key in keys.items()):
         raise DatasetError(
-            f"{out / entry.name}: was made from another version of the scene {entry.name!r} ({changed} differs); "
-            "expected the same scene, options and program",
-            hint="give --force to make the dataset again (maps that still fit are kept), or choose another --out",
+            f"{out / name}: was made from another version of the scene {name!r}; expected the same scene and program",
+            hint="give --force to make it again (maps that still fit are kept), or choose another --out",
         )
 
 
