@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldkit.frames import Pose
+from sim_bridge.clusters import Clusters, clusters
+from sim_bridge.texels import Mips, mips
 
 if TYPE_CHECKING:
     from trimesh.ray.ray_pyembree import RayMeshIntersector
@@ -20,17 +21,6 @@ Rgb = NDArray[np.uint8]
 
 # A texture smaller than this is enlarged without smoothing, so that the edges of its cells stay sharp in photos.
 MIN_TEXTURE_PX = 1024
-
-
-@dataclasses.dataclass(frozen=True)
-class Mips:
-    """Mip chains of all textures: ``texels`` uint32 packed as blue-green-red, ``levels`` int64[t,l,3].
-
-    A level is its first texel, width and height; after a texture's last level of one texel that level repeats.
-    """
-
-    texels: NDArray[np.uint32]
-    levels: NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,17 +53,40 @@ class Scene:
         """Lowest and highest corner of the mesh, float64[2,3] in m."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
+    @property
+    def _origin(self) -> Scene | None:
+        """The scene to which `with_quad` and the like added; its faces, vertices and textures are the first here."""
+        origin: Scene | None = self.__dict__.get("_derived_from")
+        return origin
+
     @functools.cached_property
     def mips(self) -> Mips:
-        """Mip chains of the textures, made at first use."""
-        return _mip_chains(self.textures)
+        """Mip chains of the textures, made at first use; what a scene was derived from is not made again."""
+        origin = self._origin
+        if origin is None:
+            return mips(self.textures)
+        added = self.textures[len(origin.textures) :]
+        return origin.mips.extended(added) if added else origin.mips
+
+    @functools.cached_property
+    def clusters(self) -> Clusters:
+        """The faces in clusters of neighbours, made at first use."""
+        origin = self._origin
+        if origin is None:
+            return clusters(self.vertices, self.faces)
+        first = len(origin.faces)
+        added = self.faces[first:]
+        return origin.clusters.joined(clusters(self.vertices, added, first=first)) if len(added) else origin.clusters
 
     @functools.cached_property
     def _rays(self) -> RayMeshIntersector:
+        """Rays against the faces of this scene that its origin has not."""
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-        mesh = trimesh.Trimesh(self.vertices, self.faces, process=False, validate=False)
+        first = len(self._origin.faces) if self._origin is not None else 0
+        used, faces = np.unique(self.faces[first:], return_inverse=True)
+        mesh = trimesh.Trimesh(self.vertices[used], faces.reshape(-1, 3), process=False, validate=False)
         return RayMeshIntersector(mesh, scale_to_box=False)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Array:
@@ -86,13 +99,19 @@ class Scene:
         ray = np.atleast_2d(np.asarray(directions, dtype=np.float64))
         start, ray = np.broadcast_arrays(start, ray)
         unit = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        origin = self._origin
+        first = len(origin.faces) if origin is not None else 0
+        nearest = np.full(len(start), np.inf) if origin is None else origin.intersect(start, unit)
+        if first == len(self.faces):
+            return nearest
         face = self._rays.intersects_first(start, unit)
         hit = face >= 0
-        a, b, c = (self.vertices[self.faces[face[hit], i]] for i in range(3))
+        a, b, c = (self.vertices[self.faces[first + face[hit], i]] for i in range(3))
         normal = np.cross(b - a, c - a)
         distance = np.full(len(start), np.inf)
         distance[hit] = ((a - start[hit]) * normal).sum(axis=1) / (unit[hit] * normal).sum(axis=1)
-        return distance
+        first_hit: Array = np.fmin(distance, nearest)
+        return first_hit
 
     def free_floor(self, xy: ArrayLike, radius_m: float) -> NDArray[np.bool_]:
         """Return bool[n]: whether a disc of this radius around points (n, 2) touches neither furniture nor walls."""
@@ -128,7 +147,7 @@ class Scene:
     def with_block(self, corners_xy: ArrayLike) -> Scene:
         """Return the scene with a further footprint, four corners (4, 2) in turn, that `free_floor` avoids."""
         block = np.asarray(corners_xy, dtype=np.float64).reshape(1, 8)
-        return dataclasses.replace(self, blocks=np.concatenate([self.blocks, block]))
+        return self._derived(blocks=np.concatenate([self.blocks, block]))
 
     def _with_quads(self, corners: Array, uv: Array, texture: Rgb, shade: float | Array, *, closed: bool) -> Scene:
         count = len(corners)
@@ -136,8 +155,7 @@ class Scene:
         faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
         corner_uv = np.concatenate([uv[:, [0, 1, 2]], uv[:, [0, 2, 3]]])
         values = np.broadcast_to(shade, (count, 3))
-        return dataclasses.replace(
-            self,
+        return self._derived(
             vertices=np.concatenate([self.vertices, corners.reshape(-1, 3)]),
             faces=np.concatenate([self.faces, faces.astype(np.int32)]),
             uv=np.concatenate([self.uv, corner_uv.astype(np.float32)]),
@@ -146,6 +164,15 @@ class Scene:
             closed=np.concatenate([self.closed, np.full(2 * count, closed)]),
             shade=np.concatenate([self.shade, np.tile(values, (2, 1)).astype(np.float32)]),
         )
+
+    def _derived(self, **changes: Any) -> Scene:
+        """Return the scene with additions; it shares this one's mips, clusters and rays, or those of its origin.
+
+        The link is no field: `dataclasses.replace` may change anything and so does not keep it.
+        """
+        result = dataclasses.replace(self, **changes)
+        result.__dict__["_derived_from"] = self._origin or self
+        return result
 
 
 def box_quads() -> tuple[Array, Array]:
@@ -167,31 +194,6 @@ def _enlarged(texture: Rgb) -> Rgb:
     while max(image.shape[:2]) * factor < MIN_TEXTURE_PX:
         factor *= 2
     return np.ascontiguousarray(np.repeat(np.repeat(image, factor, axis=0), factor, axis=1))
-
-
-def _mip_chains(textures: tuple[Rgb, ...]) -> Mips:
-    """Halve every texture down to one texel by exact area averages, in gamma space.
-
-    Averages of linear light would move black-white edges by a quarter of a pixel and so bias the size of tags.
-    """
-    chunks: list[NDArray[np.uint32]] = []
-    rows: list[list[tuple[int, int, int]]] = []
-    start = 0
-    for image in textures:
-        level = image.astype(np.float32)
-        rows.append([])
-        while True:
-            red, green, blue = np.moveaxis(np.rint(level).astype(np.uint32), 2, 0)
-            chunks.append((red | green << np.uint32(8) | blue << np.uint32(16)).ravel())
-            height, width = level.shape[:2]
-            rows[-1].append((start, width, height))
-            start += width * height
-            if width == 1 and height == 1:
-                break
-            level = cv2.resize(level, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
-    longest = max(map(len, rows))
-    levels = np.array([row + [row[-1]] * (longest - len(row)) for row in rows], np.int64)
-    return Mips(np.concatenate(chunks), levels)
 
 
 def _distance_to_block(points: Array, corners: Array) -> Array:

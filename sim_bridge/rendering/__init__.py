@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,9 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import CameraError
 from fieldkit.frames import Pose
 from sim_bridge.mesh import Scene
-from sim_bridge.rendering import lens, raster
+from sim_bridge.rendering import cull, lens, raster
+from sim_bridge.rendering.cull import Mesh, View
+from sim_bridge.rendering.shade import Picture, Textures
 
 Array = NDArray[np.float64]
 
@@ -78,31 +81,31 @@ def _directions(camera: Camera) -> Array:
 
 def _draw(scene: Scene, matrix: Array, size: tuple[int, int], *, samples: int) -> _Drawn:
     width, height = size
-    planes, boxes, source = raster.setup(
+    view = View(np.ascontiguousarray(matrix), width, height)
+    index, bounds, near = cull.visible(scene.clusters.boxes, view)
+    nearest = np.argsort(-near, kind="stable")
+    across, down = -(-width // cull.TILE_W), -(-height // cull.TILE_H)
+    bins = raster.Bins(index[nearest], near[nearest], *cull.bin_tiles(bounds[nearest], across, down))
+    picture = Picture(
+        np.empty((height, width, 3), np.uint8),
+        np.empty((height, width), np.float32),
+        np.empty((height, width), np.int32),
+    )
+    background = np.asarray(scene.background, dtype=np.float64)
+    mips = scene.mips
+    textures = Textures(mips.texels, mips.added, mips.levels, mips.base, background)
+    mesh = Mesh(
         scene.vertices,
         scene.faces,
         scene.closed,
         scene.uv,
         scene.shade,
-        np.ascontiguousarray(matrix),
-        width,
-        height,
+        scene.texture,
+        scene.clusters.order,
+        scene.clusters.starts,
     )
-    starts, members = raster.bin_tiles(planes, boxes, width, height)
-    rgb, depth, seen = raster.draw(
-        planes,
-        boxes,
-        scene.texture[source],
-        starts,
-        members,
-        scene.mips.texels,
-        scene.mips.levels,
-        np.asarray(scene.background, dtype=np.float64),
-        width,
-        height,
-        samples,
-    )
-    return _Drawn(rgb, depth, seen, planes)
+    planes = raster.draw(mesh, view, bins, textures, samples, numba.get_num_threads(), picture)
+    return _Drawn(picture.rgb, picture.depth, picture.seen, planes)
 
 
 # Name -> renderer; a further renderer is one file and one line here.
