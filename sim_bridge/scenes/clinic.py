@@ -39,7 +39,7 @@ _DOOR_AT, _DOOR_M = 0.97, 1.2
 _GREEN: Tone = (196, 214, 206)
 _PALE: Tone = (224, 226, 222)
 _LEAF: Tone = (188, 160, 122)
-_LAMP_POWER = 3.0
+_LAMP_POWER = 3.8
 
 
 def clinic(seed: int) -> Blueprint:
@@ -148,15 +148,14 @@ def _corridor(build: Builder, rng: np.random.Generator) -> None:
     for k, line in enumerate((_CORRIDOR_SOUTH, _CORRIDOR_NORTH)):
         for room in range(3):
             start = room * ROOM_X
-            shut = wall_frame(*line, start + 2.25)
+            shut = wall_frame(*line, start + 2.36)
             closed_door(build, shut, _door(build), rim=(206, 206, 200))
-            by_door = wall_frame(*line, start + _DOOR_AT + _DOOR_M / 2 + 0.2)
+            by_door = wall_frame(*line, start + _DOOR_AT + _DOOR_M / 2 + 0.12)
             label = f"{3 * k + room + 1:02d}"
             sign = build.texture(number_sign(rng, (70, 70), text=label, base=(34, 92, 110)))
-            hang(build, by_door, (0.0, 1.6), (0.2, 0.2), sign, name="door sign")
+            hang(build, by_door, (0.0, 1.6), (0.17, 0.17), sign, name="door sign")
             edge = wall_frame(*line, start + 0.2)
             build.box(edge, [0, 0.05, 0.92], [0.26, 0.03, 0.12], rail, cell_m=COARSE_M, solid=False)
-        furniture.dispensers(build, wall_frame(*line, HALL_X - 0.32))
     end = wall_frame(*_WEST, WIDTH_M / 2)
     board = build.texture(pinboard(rng, (300, 400), base=(78, 100, 130), sheets=11))
     hang(build, end, (0.0, 1.5), (1.2, 0.9), board, name="board", depth_m=0.03, rim=(150, 152, 156))
@@ -172,11 +171,13 @@ def _waiting(build: Builder, rng: np.random.Generator) -> None:
     ):
         furniture.seat_row(build, spot(x, y + float(rng.normal(0, 0.03)), yaw), seats=seats)
     furniture.low_table(build, rng, spot(11.15, 3.95, float(rng.normal(0, 4))))
-    furniture.drip_stand(build, spot(0.45, 4.5))
+    furniture.drip_stand(build, spot(0.35, 5.0))
     plant(build, rng, spot(12.4, 0.6), height_m=1.5, pot=(204, 204, 200))
     west = wall_frame(*_HALL_WALL, 2.2, side="right")
     board = build.texture(pinboard(rng, (290, 450), base=(92, 122, 96), sheets=12))
     hang(build, west, (float(rng.uniform(-0.4, 0.4)), 1.55), (1.4, 0.9), board, name="board", depth_m=0.03)
+    for at in (3.65, 6.35):
+        furniture.dispensers(build, wall_frame(*_HALL_WALL, at, side="right"))
     furniture.leaflet_rack(build, rng, wall_frame(*_HALL_WALL, 9.2, side="right"))
     east = wall_frame(*_EAST, 5.65)
     hang(build, east, (0.0, 1.65), (0.7, 1.0), _sheet(build, rng, notice, (0.7, 1.0)))

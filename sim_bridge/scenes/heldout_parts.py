@@ -48,19 +48,30 @@ def legs(size_xy: XY, height_m: float, *, thick_m: float, inset_m: float = 0.0) 
 
 
 def pillar(
-    build: Builder, place: Pose, radius_m: float, levels: tuple[float, float], texture: int, *, sides: int = 8
+    build: Builder,
+    place: Pose,
+    radius_m: float,
+    levels: tuple[float, float],
+    texture: int,
+    *,
+    sides: int = 8,
+    rows: XY = (0.0, 1.0),
 ) -> None:
-    """Add an upright prism about a place's z axis; the texture goes once around it."""
+    """Add an upright prism of an even number of sides about a place's z axis.
+
+    The texture goes once around it; ``rows`` is the part of its height that shows.
+    """
     low, high = levels
     width = 2 * radius_m * np.tan(np.pi / sides)
     for k in range(sides):
         side = place * spot(0.0, 0.0, 360.0 * k / sides)
-        part = (k / sides, 0.0, (k + 1) / sides, 1.0)
+        part = (k / sides, rows[0], (k + 1) / sides, rows[1])
         centre = on_wall(side, 0.0, (low + high) / 2, off_m=radius_m)
         build.panel(centre, (width, high - low), texture, cell_m=COARSE_M, uv=part)
-    for k in range(2):
-        lid = place * spot(0.0, 0.0, 22.5 + 45.0 * k, z=high - 0.001 * k)
-        build.panel(lid, (1.53 * radius_m,) * 2, texture, cell_m=COARSE_M, uv=(0.0, 0.0, 1.0, 0.05))
+    for k in range(sides // 2):
+        # Strips from side to side cover the top; each lies a little lower than the last, or they would flicker.
+        strip = place * spot(0.0, 0.0, 360.0 * k / sides, z=high - 0.0008 * k)
+        build.panel(strip, (width, 2 * radius_m), texture, cell_m=COARSE_M, uv=(0.0, rows[0], 1.0, rows[0] + 0.05))
 
 
 def hang(
