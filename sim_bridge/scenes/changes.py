@@ -302,4 +302,17 @@ def _change_light(
         if off:
             x, y, z = (round(float(v), 4) for v in middle)
             changes.append(Change(what="switched off", name=f"{lamp.group} lamp", at_m=(x, y, z)))
-    return tuple(result), new, Light(groups=groups), changes
+    before = sum(lamp.power for lamp in lamps)
+    after = sum(lamp.power * groups[lamp.group] for lamp in result)
+    return tuple(result), new, _dimmed(after / before if before > 0.0 else 1.0, groups), changes
+
+
+def _dimmed(ratio: float, groups: dict[str, float]) -> Light:
+    """Return the light of scaled groups when all lamps together give this share of their light.
+
+    What comes off walls and ceiling, the light's share that is not the lamps', changes with them.
+    """
+    usual = Light()
+    total = usual.lamp_share + (1.0 - usual.lamp_share) * ratio
+    exposure = usual.exposure * total ** (1 / 2.2)
+    return dataclasses.replace(usual, lamp_share=usual.lamp_share / total, exposure=exposure, groups=groups)
