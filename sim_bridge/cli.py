@@ -6,7 +6,7 @@ import dataclasses
 import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -150,7 +150,30 @@ class _ProgressLines:
         logging.getLogger(__name__).info("%d of %d waypoints, %s%s | %s", at.done, at.total, speed, left, where)
 
 
-COMMANDS = {"synthesize": synthesize, "dataset": dataset}
+def export(
+    session: tyro.conf.Positional[Path],
+    *,
+    to: Literal["streamrecorder"],
+    out: Path,
+    names: Literal["underscores", "spaces"] = "underscores",
+    force: bool = False,
+) -> None:
+    """Export the mapping walk of a session in the form that other tools read.
+
+    Args:
+        session: session folder that sim-bridge synthesized
+        to: streamrecorder: folders like those that StreamRecorder makes of a HoloLens 2
+        out: folder to write
+        names: VLC_LF as in the paper's recordings, or VLC LF as the device writes it
+        force: replace an existing export
+    """
+    from sim_bridge.mapping.streamrecorder import export_streamrecorder
+
+    counts = export_streamrecorder(session, out, separator="_" if names == "underscores" else " ", force=force)
+    logging.getLogger(__name__).info("%s: %s", out, ", ".join(f"{n} {count}" for n, count in counts.items()))
+
+
+COMMANDS: dict[str, Callable[..., None]] = {"synthesize": synthesize, "dataset": dataset, "export": export}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
