@@ -242,6 +242,7 @@ def _single_office(build: Builder, rng: np.random.Generator, look: Style, *, x0:
     # Towards the wall between the two offices, or away from it.
     inner = divider.left(2.0) if x0 == 0.0 else divider.right(2.0)
     outer = WEST.left(1.4) if x0 == 0.0 else Line((8.8, ROOMS_Y), (8.8, WIDTH_M)).left(1.6)
+    corner = yaw_pose([3.9 if x0 == 0.0 else 4.9, ROOMS_Y + 0.45, 0.0], 0.3)
     furniture.workplace(build, rng, look, inner)
     furniture.bookcase(build, rng, look, NORTH.left(LENGTH_M - (x0 + 0.6)))
     furniture.cupboard(build, look, NORTH.left(LENGTH_M - (x1 - 0.6)))
@@ -250,10 +251,10 @@ def _single_office(build: Builder, rng: np.random.Generator, look: Style, *, x0:
     if variant == 0:
         size = (1.2, 0.8)
         hang(build, on_wall(inner, 0.2, 1.55, off_m=0.0), size, prints.whiteboard(rng, px(size)), name="board")
-        furniture.carton(build, rng, yaw_pose([x0 + 3.9, ROOMS_Y + 0.45, 0.0], 0.2), height_m=0.35)
+        furniture.carton(build, rng, corner * yaw_pose([0.0, 0.0, 0.0], 0.2), height_m=0.35)
     else:
         _poster(build, rng, moved(inner, 0.4))
-        furniture.plant(build, rng, yaw_pose([x0 + 0.45, ROOMS_Y + 0.45, 0.0], 0.3))
+        furniture.plant(build, rng, corner)
 
 
 def _meeting_room(build: Builder, rng: np.random.Generator, look: Style) -> None:
