@@ -10,15 +10,27 @@ from fieldkit.errors import suggestion
 from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Scene
 from sim_bridge.scenes.blueprint import Blueprint
+from sim_bridge.scenes.clinic import clinic
+from sim_bridge.scenes.library import library
 from sim_bridge.scenes.light import lit
 from sim_bridge.scenes.lobby import lobby
+from sim_bridge.scenes.museum import museum
 from sim_bridge.scenes.office import office
 from sim_bridge.scenes.room import furnished_room
+from sim_bridge.scenes.school import school
 
 __all__ = ["SCENES", "make_blueprint", "make_scene"]
 
 # Name -> generator of the scene from a seed.
-SCENES: dict[str, Callable[[int], Blueprint]] = {"room": furnished_room, "office": office, "lobby": lobby}
+SCENES: dict[str, Callable[[int], Blueprint]] = {
+    "room": furnished_room,
+    "office": office,
+    "lobby": lobby,
+    "library": library,
+    "clinic": clinic,
+    "school": school,
+    "museum": museum,
+}
 
 
 def make_blueprint(name: str, seed: int) -> Blueprint:

@@ -22,7 +22,7 @@ def land_map(rng: np.random.Generator, size: tuple[int, int]) -> Rgb:
     apart = np.stack([np.hypot(rows - s[0] + bend, cols - s[1] + bend) for s in sites])
     country = apart.argmin(axis=0)
     colours = np.array([ink(rng, saturation=0.35, value=0.82, spread=0.12) for _ in sites])
-    image = colours[country].astype(np.uint8)
+    image: Rgb = colours[country].astype(np.uint8)
     borders = cv2.morphologyEx(country.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     image[borders] = (120, 60, 60)
     sea = ground < np.quantile(ground, rng.uniform(0.3, 0.6))

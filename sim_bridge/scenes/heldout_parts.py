@@ -68,10 +68,14 @@ def pillar(
         part = (k / sides, rows[0], (k + 1) / sides, rows[1])
         centre = on_wall(side, 0.0, (low + high) / 2, off_m=radius_m)
         build.panel(centre, (width, high - low), texture, cell_m=COARSE_M, uv=part)
+    part = (0.0, rows[0], 0.25, (rows[0] + rows[1]) / 2)
     for k in range(sides // 2):
-        # Strips from side to side cover the top; each lies a little lower than the last, or they would flicker.
+        # Strips from side to side cover the ends; each lies a little inside the last, or they would flicker.
         strip = place * spot(0.0, 0.0, 360.0 * k / sides, z=high - 0.0008 * k)
-        build.panel(strip, (width, 2 * radius_m), texture, cell_m=COARSE_M, uv=(0.0, rows[0], 1.0, rows[0] + 0.05))
+        build.panel(strip, (width, 2 * radius_m), texture, cell_m=COARSE_M, uv=part)
+        if low > 0.0:
+            over = Pose.from_components([0.0, 0.0, low - high + 0.0016 * k], Rotation.from_euler("x", np.pi))
+            build.panel(strip * over, (width, 2 * radius_m), texture, cell_m=COARSE_M, uv=part)
 
 
 def hang(

@@ -103,12 +103,13 @@ def emblem(rng: np.random.Generator, image: Rgb, centre: tuple[float, float], ra
         _polygon(image, middle + np.stack([np.cos(angle), np.sin(angle)], 1) * reach[:, None], rgb)
     elif kind == 2:
         arrow = np.array([[-1, -0.3], [0.1, -0.3], [0.1, -0.8], [1, 0], [0.1, 0.8], [0.1, 0.3], [-1, 0.3]]) * radius
-        angle = rng.integers(4) * np.pi / 2
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        quarter = int(rng.integers(4))
+        turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarter)
         _polygon(image, middle + arrow @ turn.T, rgb)
     elif kind == 3:
-        for angle in np.array([0.0, np.pi / 2]) + rng.choice([0.0, np.pi / 4]):
-            cv2.line(image, *_ends(middle, 0.8 * radius, float(angle)), rgb, 2 * thick, cv2.LINE_AA)
+        first = float(rng.choice([0.0, np.pi / 4]))
+        for tilt in (first, first + np.pi / 2):
+            cv2.line(image, *_ends(middle, 0.8 * radius, tilt), rgb, 2 * thick, cv2.LINE_AA)
     elif kind == 4:
         x = np.linspace(-radius, radius, 40)
         for k in range(int(rng.integers(2, 5))):

@@ -28,8 +28,8 @@ _STRIPES: Rect = (WEST_X, 0.0, FOYER_X, CROSS_Y)
 _FOYER: Rect = (FOYER_X, 0.0, LENGTH_M, CROSS_Y)
 _WHITE: Tone = (218, 216, 210)
 _ROSE: Tone = (190, 172, 164)
-_LAMP_POWER = 6.0
-_SPOT_POWER = 2.4
+_LAMP_POWER = 8.0
+_SPOT_POWER = 3.4
 
 
 def museum(seed: int) -> Blueprint:
@@ -94,13 +94,13 @@ def _some_painting(build: Builder, rng: np.random.Generator, place: Pose, *, wid
 
 def _hall_of_paintings(build: Builder, rng: np.random.Generator) -> None:
     for line, places, widest in (
-        (_WEST, (1.7, 5.0, 8.2), 1.6),
+        (_WEST, (1.3, 3.6, 6.2, 8.6), 1.5),
         (_LONG, (4.6, 9.2), 1.0),
         (_SOUTH, (3.0,), 1.4),
         (_NORTH, (LENGTH_M - 3.0,), 1.5),
     ):
         for at in places:
-            place = wall_frame(*line, at + float(rng.uniform(-0.3, 0.3)))
+            place = wall_frame(*line, at + float(rng.uniform(-0.25, 0.25)))
             _some_painting(build, rng, place, widest_m=widest)
     middle = spot(3.0, 5.0, float(rng.normal(0, 2)))
     furniture.partition(build, rng, middle, width_m=2.4, height_m=2.5)
@@ -133,7 +133,7 @@ def _striped_hall(build: Builder, rng: np.random.Generator) -> None:
             furniture.exhibit(build, rng, spot(x, y, float(rng.uniform(-3, 3))))
     place = wall_frame(*_SOUTH, 8.75 + float(rng.uniform(-0.3, 0.3)))
     _some_painting(build, rng, place, widest_m=1.2)
-    furniture.bench(build, spot(8.75, 1.1))
+    furniture.bench(build, spot(8.75, 0.62))
 
 
 def _foyer(build: Builder, rng: np.random.Generator) -> None:

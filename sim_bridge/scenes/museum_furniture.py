@@ -86,7 +86,7 @@ def stones(build: Builder, rng: np.random.Generator, place: Pose, *, height_m: f
 
 def statue(build: Builder, rng: np.random.Generator, place: Pose) -> None:
     """Stand a figure of stone, larger than life, on a low base."""
-    stone = _stone(build, rng)
+    stone = build.texture(speckled(rng, (160, 160), base=(150, 146, 136)))
     with build.thing("statue", place, kind="fixed"):
         build.box(place, [0, 0, 0.2], [0.9, 0.9, 0.4], tone(build, GRAPHITE), cell_m=0.3)
         for x in (-0.14, 0.14):
@@ -178,10 +178,13 @@ def barrier(build: Builder, place: Pose, *, length_m: float) -> None:
             pillar(build, place * spot(x, 0.0), 0.13, (0.0, 0.03), metal)
             solids(build, place, [((x, 0, 0.48), (0.04, 0.04, 0.92))], metal)
         cord = tone(build, (110, 24, 34))
-        for k in range(4):
-            drop = 0.82 - 0.1 * (1 - abs(k - 1.5) / 1.5)
-            part = ((k - 1.5) * length_m / 4, 0.0, drop)
-            solids(build, place, [(part, (length_m / 4, 0.03, 0.03))], cord)
+        along = np.linspace(-length_m / 2, length_m / 2, 7)
+        up = 0.68 + 0.2 * (2 * along / length_m) ** 2
+        for k in range(6):
+            run, rise = float(along[k + 1] - along[k]), float(up[k + 1] - up[k])
+            turn = Rotation.from_euler("y", -np.arctan2(rise, run))
+            part = Pose.from_components([(along[k] + along[k + 1]) / 2, 0.0, (up[k] + up[k + 1]) / 2], turn)
+            build.box(place * part, [0, 0, 0], [np.hypot(run, rise) + 0.015, 0.03, 0.03], cord, cell_m=COARSE_M)
         build.block(place, (length_m + 0.26, 0.26))
 
 

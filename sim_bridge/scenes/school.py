@@ -23,7 +23,7 @@ from sim_bridge.scenes.heldout_parts import (
     spot,
     tone,
 )
-from sim_bridge.scenes.heldout_prints import Picture, notice, number_sign, pinboard
+from sim_bridge.scenes.heldout_prints import Picture, Rgb, notice, number_sign, pinboard
 from sim_bridge.scenes.heldout_surfaces import basket, grid_ceiling, two_tone
 from sim_bridge.scenes.plan import Opening, wall_frame, window
 
@@ -67,7 +67,7 @@ def _building(build: Builder, rng: np.random.Generator) -> None:
     ceiling = grid_ceiling((720, 900), base=(234, 232, 226), cell_px=72)
     shell(build, (0.0, 0.0, LENGTH_M, WIDTH_M), height_m=HEIGHT_M, floor=floor, ceiling=ceiling, cell_m=0.12)
 
-    def lined(line: tuple[XY, XY]) -> furniture.Rgb:
+    def lined(line: tuple[XY, XY]) -> Rgb:
         return two_tone(rng, paint.pixels(line), upper=_CREAM, lower=_OCHRE, share=0.42)
 
     at_south = [Opening(x, 1.5, 2.7, 1.0) for x in (2.2, 4.6, 7.0, 11.9)]

@@ -182,11 +182,11 @@ def easel(build: Builder, rng: np.random.Generator, place: Pose, picture: Rgb) -
     wood, tilt = tone(build, PINE), Rotation.from_euler("x", 8, degrees=True)
     board = place * Pose.from_components([0.0, 0.06, 0.0], tilt)
     with build.thing("easel", place):
-        posts: list[Solid] = [((x, -0.05, 0.9), (0.035, 0.035, 1.8)) for x in (-0.25, 0.25)]
+        posts: list[Solid] = [((x, -0.05, 0.915), (0.035, 0.035, 1.8)) for x in (-0.25, 0.25)]
         posts += [((0, -0.03, 0.75), (0.7, 0.05, 0.03))]
         solids(build, board, posts, wood)
         rear = place * Pose.from_components([0.0, -0.5, 0.0], Rotation.from_euler("x", -10, degrees=True))
-        solids(build, rear, [((0, 0, 0.8), (0.035, 0.035, 1.6))], wood)
+        solids(build, rear, [((0, 0, 0.81), (0.035, 0.035, 1.6))], wood)
         edge = tone(build, (238, 236, 228))
         build.box(board, [0, 0, 1.2], [0.66, 0.02, 0.86], edge, front=build.texture(picture), cell_m=0.4)
         build.block(place * spot(0.0, -0.2), (0.72, 0.76))
