@@ -30,7 +30,7 @@ def synthesize(
     layout: str = "generic",
     waypoints: int = 4,
     starts: Literal["each", "once"] = "each",
-    stations: int = 54,
+    stations: int | None = None,
     quality: int | None = None,
     sensors: str = "standard",
     without: tuple[str, ...] = (),
@@ -49,7 +49,7 @@ def synthesize(
         layout: names of topics and frames: generic, or those of a driver, spot_ros1 or spot_ros2
         waypoints: number of waypoints, each with a tripod tag
         starts: each waypoint reached from the start tag, as in the paper, or once for the whole session
-        stations: number of places at which the mapping rig takes its images
+        stations: number of places at which the mapping rig takes its images; about one every 0.85 m by default
         quality: JPEG quality of the arm camera's images, 1 to 100; by default that of its sensor
         sensors: what the sensors add: standard, ideal (nothing), or a TOML file like a session's sensors.toml
         without: effects to switch off: lens, exposure, vignetting, noise, blur, jpeg, depth_noise, depth_holes
@@ -68,7 +68,7 @@ def synthesize(
 
     limits = (
         ("waypoints", waypoints, 1, 20),
-        ("stations", stations, 2, 999),
+        ("stations", 2 if stations is None else stations, 2, 999),
         ("quality", 90 if quality is None else quality, 1, 100),
     )
     for name, value, low, high in limits:

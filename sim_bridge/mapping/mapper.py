@@ -18,6 +18,7 @@ from sim_bridge.aim import UPRIGHT_FROM_CAM, turn
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
 from sim_bridge.sensors import ColourSensor, DepthSensor, Motion, bent, effects, encode, expose, sense_depth
+from sim_bridge.stage import tours
 
 Array = NDArray[np.float64]
 
@@ -28,6 +29,10 @@ DEPTH = Camera("PINHOLE", 320, 288, (208.5, 208.5, 160.0, 144.0))
 BASELINE_M = 0.0995
 OUTWARDS_DEG = 52.0
 LOOP_STEP_M = 0.05
+# A quarter turn counts as a metre and a half of walking.
+METRES_PER_QUARTER_TURN = 1.5
+METRES_PER_STATION = 0.85
+MOST_STATIONS = 150
 # What 16 bits of millimetres can hold.
 DEPTH_FAR_M = 65.0
 
@@ -36,10 +41,11 @@ DEPTH_FAR_M = 65.0
 class WalkOptions:
     """How the walk is taken and how well the device tracks itself.
 
-    ``laps`` above 1 repeats the beginning, so that the walk closes. The drift is a random walk per root of metre.
+    ``stations`` None takes one about every METRES_PER_STATION. ``laps`` above 1 repeats the beginning, so that the walk
+    closes. The drift is a random walk per root of metre.
     """
 
-    stations: int = 54
+    stations: int | None = None
     laps: float = 1.04
     height_m: float = 1.65
     look_around_deg: float = 15.0
@@ -89,11 +95,13 @@ def _mounted(position_m: tuple[float, float, float], yaw_deg: float, *, pitch_de
 def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tuple[Station, ...]:
     """Walk along the scene's loop and return the stations, evenly spaced, with natural bob and turning of the head.
 
+    A scene without a loop of its own is toured through all its free floor.
     SLAM's frame starts below the first station, z up.
     """
     path, tangent = _smooth_loop(scene, step_m=LOOP_STEP_M)
-    count, phase = options.stations, rng.uniform(0.0, 2 * np.pi, 4)
+    phase = rng.uniform(0.0, 2 * np.pi, 4)
     at, metres = _places(len(path), tangent, options)
+    count = len(at)
     around = np.radians(options.look_around_deg)
     yaw = tangent[at] + around * np.sin(2 * np.pi * metres / 5.3 + phase[0])
     yaw = yaw + np.radians(rng.normal(0.0, 1.5, count))
@@ -124,15 +132,18 @@ def _places(length: int, heading: Array, options: WalkOptions) -> tuple[NDArray[
     laps, rest = np.divmod(index, length)
     total_turn = heading[-1] - heading[0] + _wrapped(heading[0] - heading[-1])
     turned = np.abs(np.diff(heading[rest] + laps * total_turn))
-    effort = np.concatenate([[0.0], np.cumsum(LOOP_STEP_M + turned * (1.5 / (np.pi / 2)))])
-    wanted = np.linspace(0.0, effort[-1], options.stations, endpoint=False)
+    per_rad = METRES_PER_QUARTER_TURN / (np.pi / 2)
+    effort = np.concatenate([[0.0], np.cumsum(LOOP_STEP_M + turned * per_rad)])
+    count = options.stations or min(max(round(effort[-1] / METRES_PER_STATION), 12), MOST_STATIONS)
+    wanted = np.linspace(0.0, effort[-1], count, endpoint=False)
     place = np.searchsorted(effort, wanted)
     return rest[place].astype(np.intp), place.astype(np.float64) * LOOP_STEP_M
 
 
 def _smooth_loop(scene: Scene, *, step_m: float) -> tuple[Array, Array]:
     """Return the scene's loop as points (n, 2), rounded as far as the free floor allows, and its heading (n,)."""
-    corners = np.vstack([scene.walk_xy, scene.walk_xy[:1]])
+    loop = scene.walk_xy if len(scene.walk_xy) else tours.tour(scene)
+    corners = np.vstack([loop, loop[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     count = max(round(along[-1] / step_m), 8)
     at = np.linspace(0.0, along[-1], count, endpoint=False)

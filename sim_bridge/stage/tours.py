@@ -1,0 +1,179 @@
+"""A mapping walk through free floor: a closed tour that comes near everything, and the floor area that it shows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from sim_bridge.errors import SynthesisError
+from sim_bridge.mesh import Scene
+from sim_bridge.stage.paths import CELL_M, FloorGraph, floor_graph, spaced
+
+Array = NDArray[np.float64]
+
+# A person who carries a camera needs a disc of this radius; where that leads nowhere, less.
+WALKER_RADII_M = (0.36, 0.28, 0.2)
+EYE_M = 1.65
+STEP_M = 0.05
+# The tour passes all free floor within the first of these distances that keeps it shorter than METRES_PER_M2.
+REACHES_M = (0.9, 1.1, 1.3, 1.6, 2.0, 2.5)
+METRES_PER_M2 = 0.55
+# Nooks of free floor smaller than this are seen from outside.
+NOOK_M2 = 0.25
+
+
+def tour(scene: Scene) -> Array:
+    """Return a closed polyline (n, 2) in m, about STEP_M apart, that passes near all connected free floor.
+
+    The last point leads to the first. Passages are walked both ways where they are the only way. Raises
+    SynthesisError for a scene without free floor.
+    """
+    graph, radius_m = walkable(scene)
+    longest = METRES_PER_M2 * shown_area_m2(scene, graph)
+    loop = np.empty((0, 2))
+    for reach_m in REACHES_M:
+        stops = _stops(graph, reach_m)
+        loop = _loop(graph, stops)
+        if _length(loop) <= longest:
+            break
+    return smoothed_loop(scene, loop, radius_m=radius_m)
+
+
+def walkable(scene: Scene) -> tuple[FloorGraph, float]:
+    """Return the largest connected part of the free floor as a graph, and the walker's radius in m.
+
+    Raises SynthesisError where not even a narrow walker finds free floor.
+    """
+    for radius_m in WALKER_RADII_M:
+        try:
+            graph = largest_part(floor_graph(scene, radius_m))
+        except SynthesisError:
+            if radius_m == WALKER_RADII_M[-1]:
+                raise
+            continue
+        if len(graph.centres) * CELL_M**2 > 1.0 or radius_m == WALKER_RADII_M[-1]:
+            return graph, radius_m
+    raise AssertionError("unreachable")
+
+
+def largest_part(graph: FloorGraph) -> FloorGraph:
+    """Return the largest connected part of a floor."""
+    _, part = connected_components(graph.steps, directed=False)
+    kept = np.flatnonzero(part == np.argmax(np.bincount(part)))
+    return FloorGraph(graph.centres[kept], csr_array(graph.steps[kept][:, kept]))
+
+
+def shown_area_m2(scene: Scene, graph: FloorGraph) -> float:
+    """Return the area in m2 inside the floor's bounds that is seen at eye height from the free floor.
+
+    Furniture lower than the eyes counts, what lies behind walls does not.
+    """
+    x0, y0, x1, y1 = scene.floor_bounds
+    if not len(scene.faces):
+        return (x1 - x0) * (y1 - y0)
+    cell = 0.2
+    shape = (int(np.ceil((x1 - x0) / cell)), int(np.ceil((y1 - y0) / cell)))
+    seen = np.zeros(shape, np.bool_)
+    # Every free cell's eye would show no more than one per square of half a metre.
+    _, spots = np.unique(np.floor(graph.centres / 0.5).astype(int), axis=0, return_index=True)
+    angles = np.linspace(0.0, 2 * np.pi, 240, endpoint=False)
+    rays = np.column_stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)])
+    steps = np.arange(0.0, 12.0, cell / 2)
+    for spot in graph.centres[spots]:
+        free = scene.intersect([*spot, EYE_M], rays)
+        along = spot + steps[:, None, None] * rays[None, :, :2]
+        index = np.floor((along[steps[:, None] < free[None]] - [x0, y0]) / cell).astype(int)
+        inside = ((index >= 0) & (index < shape)).all(axis=1)
+        seen[tuple(index[inside].T)] = True
+    return float(seen.sum()) * cell**2
+
+
+def _stops(graph: FloorGraph, reach_m: float) -> NDArray[np.intp]:
+    """Choose cells such that every cell lies within a walk of ``reach_m`` of one, greedily those that reach most."""
+    # A quarter of the cells is enough to choose from.
+    cells = np.round(graph.centres / CELL_M).astype(int)
+    candidates = np.flatnonzero((cells % 2 == 0).all(axis=1))
+    if not len(candidates):
+        candidates = np.arange(len(cells))
+    reached = []
+    for chunk in np.array_split(candidates, max(1, len(candidates) // 200)):
+        # Steps beside furniture cost up to threefold: there a stop reaches less far, and so lies nearer.
+        cost = dijkstra(graph.steps, directed=False, indices=chunk, limit=1.5 * reach_m)
+        reached += [np.flatnonzero(np.isfinite(row)) for row in cost]
+    open_cells = np.ones(len(cells), np.bool_)
+    gains = np.array([len(r) for r in reached], dtype=np.float64)
+    chosen: list[int] = []
+    while True:
+        # Gains only shrink: the best one that is still up to date is the best of all.
+        best = int(np.argmax(gains))
+        gain = float(open_cells[reached[best]].sum())
+        if gain < gains[best]:
+            gains[best] = gain
+            continue
+        if chosen and gain * CELL_M**2 < NOOK_M2:
+            break
+        chosen.append(best)
+        open_cells[reached[best]] = False
+        gains[best] = 0.0
+    return candidates[chosen]
+
+
+def _loop(graph: FloorGraph, stops: NDArray[np.intp]) -> Array:
+    """Return the cells (n, 2) of a short closed walk through all stops."""
+    cost, previous = dijkstra(graph.steps, directed=False, indices=stops, return_predecessors=True)
+    order = _round_trip(cost[:, stops])
+    cells: list[int] = []
+    for k, first in enumerate(order):
+        last = order[(k + 1) % len(order)]
+        way = [int(stops[last])]
+        while way[-1] != stops[first]:
+            way.append(int(previous[first, way[-1]]))
+        cells += way[:0:-1] if len(way) > 1 else way
+    return graph.centres[cells]
+
+
+def _round_trip(cost: Array) -> list[int]:
+    """Return the order of a short round trip: cheapest insertion, then turning stretches around while it helps."""
+    count = len(cost)
+    trip, rest = [0], set(range(1, count))
+    near = cost[0].copy()
+    while rest:
+        # The farthest stop is inserted next, where it costs least.
+        stop = max(rest, key=lambda s: (near[s], s))
+        after = np.roll(trip, -1)
+        detour = cost[trip, stop] + cost[stop, after] - cost[trip, after]
+        trip.insert(int(np.argmin(detour)) + 1, stop)
+        rest.remove(stop)
+        near = np.minimum(near, cost[stop])
+    better = True
+    while better and count > 3:
+        better = False
+        for i in range(count - 1):
+            a, b = trip[i], trip[i + 1]
+            js = np.arange(i + 2, count if i else count - 1)
+            if not len(js):
+                continue
+            ends, nexts = np.array(trip)[js], np.array(trip)[(js + 1) % count]
+            gain = cost[a, b] + cost[ends, nexts] - cost[a, ends] - cost[b, nexts]
+            best = int(np.argmax(gain))
+            if gain[best] > 1e-9:
+                j = int(js[best])
+                trip[i + 1 : j + 1] = trip[i + 1 : j + 1][::-1]
+                better = True
+    return trip
+
+
+def smoothed_loop(scene: Scene, corners: Array, *, radius_m: float, rounds: int = 120) -> Array:
+    """Return a closed polyline (n, 2), STEP_M apart, rounded wherever a disc of this radius stays on free floor."""
+    path = spaced(np.vstack([corners, corners[:1]]), STEP_M)[:-1]
+    for _ in range(rounds):
+        moved = 0.25 * np.roll(path, 1, axis=0) + 0.5 * path + 0.25 * np.roll(path, -1, axis=0)
+        free = scene.free_floor(moved, radius_m)
+        path = np.where(free[:, None], moved, path)
+    return spaced(np.vstack([path, path[:1]]), STEP_M)[:-1]
+
+
+def _length(loop: Array) -> float:
+    return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
