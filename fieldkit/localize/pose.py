@@ -7,12 +7,13 @@ import dataclasses
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from fieldkit.frames import Pose, exp
+from fieldkit.frames import Pose
+from fieldkit.localize.kernels import MIN_DEPTH_M, normal_equations
 
 Array = NDArray[np.float64]
 
-_NOISE_PX = 1.0
 # Weights 1 / (1 + r^2) of whitened residuals r (Cauchy) overstate the covariance of Gaussian ones: for r of unit
 # variance in two dimensions the asymptotic covariance is this factor times the inverse of the weighted information,
 # E[g] E[g^2 r^2] / 2 / (E[g] + E[g' r] / 2)^2 with g the weight.
@@ -21,7 +22,6 @@ _CAUCHY_FACTOR = 0.6123
 # them. Set on one synthesized room whose map has its scale from depth: there the trimmed normalised errors of photos
 # and views are 0.8 and 0.6 per degree of freedom with it, 2.3 and 1.1 without. A wrong map scale is not in it.
 _SHARED = 0.01
-_MIN_DEPTH_M = 0.05
 # Shares of the inlier bound at which RANSAC is started. Distant, nearly planar landmarks have two poses that agree
 # with all of them within a wide bound; a tight one, and the sum of the residuals, tells them apart.
 _STARTS = (1.0, 0.3, 0.12)
@@ -69,7 +69,14 @@ def estimate_pose(points: PosedPoints, *, max_error_px: float, seed: int) -> Sol
 
 def _robust_cost(points: PosedPoints, map_from_cam: Pose) -> float:
     """Return the Cauchy cost of all matches, right and wrong, at a pose."""
-    return float(np.log1p((_linearized(points, map_from_cam)[1] ** 2).sum(axis=1)).sum())
+    return float(_sums(points, map_from_cam.rotation.as_matrix(), np.array(map_from_cam.translation))[2])
+
+
+def _sums(points: PosedPoints, rotation: Array, position: Array) -> tuple[Array, Array, float]:
+    """Return information (6, 6), gradient (6,) and Cauchy cost of all points at a pose map_from_cam."""
+    arrays = (points.pixels, points.xyz, points.xyz_covariance, np.asarray(points.focal_px), rotation, position)
+    information, gradient, cost = normal_equations(*(np.ascontiguousarray(a, dtype=np.float64) for a in arrays))
+    return information, gradient, float(cost)
 
 
 def _ransac(points: PosedPoints, *, max_error_px: float, seed: int) -> Solved | None:
@@ -96,19 +103,18 @@ def refine_pose(points: PosedPoints, map_from_cam: Pose, *, iterations: int = 20
     Every residual is whitened by its own 2x2 covariance: 1 px of noise plus the landmark's uncertainty projected
     into the image; large residuals count less (Cauchy). The covariance takes the landmarks' errors as independent.
     """
+    rotation, position = map_from_cam.rotation.as_matrix(), np.array(map_from_cam.translation)
     for _ in range(iterations):
-        jacobian, whitened = _linearized(points, map_from_cam)
-        gain = 1.0 / (1.0 + (whitened**2).sum(axis=1))
-        information = np.einsum("n,nki,nkj->ij", gain, jacobian, jacobian)
-        step = np.linalg.lstsq(information, -np.einsum("n,nki,nk->i", gain, jacobian, whitened), rcond=None)[0]
-        map_from_cam = map_from_cam * exp(step)
+        information, gradient, _ = _sums(points, rotation, position)
+        step = np.linalg.lstsq(information, -gradient, rcond=None)[0]
+        position = position + rotation @ step[3:]
+        rotation = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
         if float(np.abs(step).max()) < 1e-9:
             break
-    jacobian, whitened = _linearized(points, map_from_cam)
-    gain = 1.0 / (1.0 + (whitened**2).sum(axis=1))
-    information = np.einsum("n,nki,nkj->ij", gain, jacobian, jacobian)
+    information, _, _ = _sums(points, rotation, position)
     covariance = _CAUCHY_FACTOR * np.linalg.pinv(information, hermitian=True)
-    return map_from_cam, 0.5 * (covariance + covariance.T)
+    refined = Pose.from_components(position, Rotation.from_matrix(rotation))
+    return refined, 0.5 * (covariance + covariance.T)
 
 
 def shared_covariance(points: PosedPoints, map_from_cam: Pose) -> Array:
@@ -121,7 +127,7 @@ def shared_covariance(points: PosedPoints, map_from_cam: Pose) -> Array:
     rotation = map_from_cam.rotation.as_matrix()
     distance = float(np.median(np.linalg.norm(points.xyz - map_from_cam.translation, axis=1)))
     result = np.zeros((6, 6))
-    result[:3, :3] = np.eye(3) * np.trace(displacement) / 3.0 / max(distance, _MIN_DEPTH_M) ** 2
+    result[:3, :3] = np.eye(3) * np.trace(displacement) / 3.0 / max(distance, MIN_DEPTH_M) ** 2
     result[3:, 3:] = rotation.T @ displacement @ rotation
     return 0.5 * (result + result.T)
 
@@ -136,28 +142,8 @@ def log_mean(covariances: Array) -> Array:
 
 def _residuals(points: PosedPoints, map_from_cam: Pose) -> tuple[Array, Array]:
     x_in_cam = map_from_cam.inv().apply(points.xyz)
-    depth = np.maximum(x_in_cam[:, 2:], _MIN_DEPTH_M)
+    depth = np.maximum(x_in_cam[:, 2:], MIN_DEPTH_M)
     return x_in_cam[:, :2] / depth * points.focal_px - points.pixels, x_in_cam
-
-
-def _linearized(points: PosedPoints, map_from_cam: Pose) -> tuple[Array, Array]:
-    """Return whitened Jacobians (n, 2, 6) by the right perturbation of map_from_cam, and whitened residuals (n, 2)."""
-    residual, x_in_cam = _residuals(points, map_from_cam)
-    x, y, z = x_in_cam[:, 0], x_in_cam[:, 1], np.maximum(x_in_cam[:, 2], _MIN_DEPTH_M)
-    (fx, fy), zero = points.focal_px, np.zeros(len(x_in_cam))
-    by_point = np.stack(
-        [np.stack([fx / z, zero, -fx * x / z**2], axis=1), np.stack([zero, fy / z, -fy * y / z**2], axis=1)], axis=1
-    )
-    # x_in_cam of map_from_cam * Exp(w, v) is x_in_cam + [x_in_cam]x w - v to first order.
-    cross = np.zeros((len(x), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -x_in_cam[:, 2], x_in_cam[:, 1], -x_in_cam[:, 0]
-    cross -= cross.transpose(0, 2, 1)
-    jacobian = np.concatenate([by_point @ cross, -by_point], axis=2)
-    by_landmark = by_point @ map_from_cam.inv().rotation.as_matrix()
-    covariance = by_landmark @ points.xyz_covariance @ by_landmark.transpose(0, 2, 1) + _NOISE_PX**2 * np.eye(2)
-    lower = np.linalg.cholesky(covariance)
-    solved = np.linalg.solve(lower, np.concatenate([jacobian, residual[:, :, None]], axis=2))
-    return solved[:, :, :6], solved[:, :, 6]
 
 
 def _subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
