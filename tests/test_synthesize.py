@@ -26,8 +26,11 @@ from sim_bridge.errors import SynthesisError
 from sim_bridge.mapping import mapper, photographer
 from sim_bridge.mesh import Scene
 from sim_bridge.recording import recorder, schedule
-from sim_bridge.scenes import SCENES, make_scene
+from sim_bridge.scenes import SCENES, make_blueprint, make_scene
+from sim_bridge.scenes.changes import STANDARD_CHANGES, find_changes, make_worlds
+from sim_bridge.sensors import STANDARD, load_sensors
 from sim_bridge.stage import staging
+from sim_bridge.stage.paths import floor_graph
 from sim_bridge.synthesize import SessionOptions, generator
 
 # A robot in a hurry makes short recordings.
@@ -404,6 +407,24 @@ def test_session_toml_names_the_recording(session: Path) -> None:
     found = read_session(session / "session.toml")
     assert (found.session, found.recording, found.layout) == ("room-1", "robot.mcap", "generic")
     assert found.visit == ()
+
+
+def test_a_session_stores_its_sensors_and_changes(session: Path) -> None:
+    assert load_sensors(str(session / "sensors.toml")) == STANDARD
+    assert find_changes(str(session / "changes.toml")) == STANDARD_CHANGES
+    assert "[[change]]" in (session / "truth" / "changes.toml").read_text()
+
+
+def test_what_is_staged_has_room_before_and_after_the_changes() -> None:
+    worlds = make_worlds(make_blueprint("room", SEED), STANDARD_CHANGES, seed=SEED)
+    stage = staging.set_stage(worlds.both, TINY.stage, rng=generator(SEED, 4))
+    bodies = np.array([w.world_from_body.translation[:2] for w in stage.waypoints])
+    tripods = np.array([w.tag.world_from_tag.translation[:2] for w in stage.waypoints])
+    for world in (worlds.mapped, worlds.visited):
+        assert world.free_floor(bodies, TINY.stage.waypoint_radius_m).all()
+        assert world.free_floor(tripods, 0.12).all()
+        graph = floor_graph(staging.set_in(world, stage).scene, TINY.stage.drive_radius_m)
+        assert graph.connects([stage.world_from_start.translation[:2], *bodies])
 
 
 def test_an_interrupted_synthesis_leaves_nothing(tmp_path: Path) -> None:
