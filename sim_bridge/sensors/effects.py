@@ -1,4 +1,4 @@
-"""What a sensor adds to a rendered image: noise, and the file formats."""
+"""The file formats of sensors, and their grey."""
 
 from __future__ import annotations
 
@@ -9,17 +9,6 @@ from numpy.typing import NDArray
 from sim_bridge.sensors.models import ColourSensor
 
 Image = NDArray[np.uint8]
-
-
-def add_noise(image: Image, *, sigma: float, rng: np.random.Generator) -> Image:
-    """Return the image with noise of a standard deviation (grey levels), the same in all channels of a pixel."""
-    if sigma <= 0.0:
-        return image
-    noise = rng.standard_normal(image.shape[:2], dtype=np.float32) * np.float32(sigma)
-    levels = np.rint(noise).astype(np.int16)
-    shift = levels if image.ndim == 2 else cv2.merge([levels] * 3)
-    result: Image = cv2.add(image, shift, dtype=cv2.CV_8U)
-    return result
 
 
 def grey(rgb: Image) -> Image:
