@@ -132,78 +132,50 @@ def _polygon(image: Rgb, points: NDArray[np.float64], rgb: Ink) -> None:
 
 def notice(rng: np.random.Generator, size: tuple[int, int]) -> Rgb:
     """Draw a printed sheet: heading, emblem or picture, and text, in one of four layouts."""
-    height, width = size
     strong = ink(rng, saturation=0.75, value=0.55)
     image = filled(size, ink(rng, saturation=0.12, value=0.93, spread=0.07))
-    layout = int(rng.integers(4))
-    if layout == 0:
-        image[: int(rng.uniform(0.18, 0.3) * height)] = strong
-        letter(image, word(rng).upper(), (0.07 * width, 0.16 * height), 0.09 * height, (245, 245, 240), bold=2)
-        emblem(rng, image, (0.5 * width, 0.52 * height), 0.17 * min(size), strong)
-        paragraph(
-            rng,
-            image,
-            (0.08 * width, 0.72 * height, 0.92 * width, 0.94 * height),
-            line_px=14,
-            rgb=(50, 50, 55),
-        )
-    elif layout == 1:
-        edge = int(rng.uniform(0.2, 0.34) * width)
-        image[:, :edge] = strong
-        for k in range(int(rng.integers(2, 5))):
-            emblem(
-                rng,
-                image,
-                (edge / 2, (0.14 + 0.24 * k) * height),
-                0.36 * edge,
-                ink(rng, saturation=0.2, value=0.9),
-            )
-        letter(
-            image,
-            word(rng),
-            (edge + 0.05 * width, 0.17 * height),
-            0.1 * height,
-            strong,
-            font=SLANTED,
-            bold=2,
-        )
-        box = (edge + 0.06 * width, 0.26 * height, 0.95 * width, 0.92 * height)
-        paragraph(rng, image, box, line_px=17, rgb=(60, 60, 60))
-    elif layout == 2:
-        photo = tinted(ink(rng, value=0.5), 34 * fractal(rng, (height // 2, width), cell_px=width / 3, octaves=5))
-        image[: height // 2] = photo
-        for _ in range(int(rng.integers(2, 6))):
-            where = (float(rng.uniform(0.1, 0.9)) * width, float(rng.uniform(0.1, 0.4)) * height)
-            emblem(rng, image, where, float(rng.uniform(0.06, 0.16)) * width, ink(rng))
-        letter(image, f"{word(rng)} {word(rng)}", (0.06 * width, 0.64 * height), 0.07 * height, strong, bold=2)
-        paragraph(
-            rng,
-            image,
-            (0.06 * width, 0.7 * height, 0.94 * width, 0.95 * height),
-            line_px=15,
-            rgb=(40, 40, 60),
-        )
-    else:
-        image[:] = strong
-        letter(
-            image,
-            str(rng.integers(10, 99)),
-            (0.1 * width, 0.5 * height),
-            0.34 * height,
-            (250, 240, 210),
-            bold=9,
-        )
-        for k in range(3):
-            letter(
-                image,
-                word(rng),
-                (0.1 * width, (0.66 + 0.12 * k) * height),
-                0.06 * height,
-                (240, 240, 240),
-                bold=2,
-            )
-        cv2.rectangle(image, (4, 4), (width - 5, height - 5), (235, 230, 215), 3)
+    layouts = (_headed, _edged, _illustrated, _numbered)
+    layouts[int(rng.integers(len(layouts)))](rng, image, strong)
     return image
+
+
+def _headed(rng: np.random.Generator, image: Rgb, strong: Ink) -> None:
+    height, width = image.shape[:2]
+    image[: int(rng.uniform(0.18, 0.3) * height)] = strong
+    letter(image, word(rng).upper(), (0.07 * width, 0.16 * height), 0.09 * height, (245, 245, 240), bold=2)
+    emblem(rng, image, (0.5 * width, 0.52 * height), 0.17 * min(height, width), strong)
+    paragraph(rng, image, (0.08 * width, 0.72 * height, 0.92 * width, 0.94 * height), line_px=14, rgb=(50, 50, 55))
+
+
+def _edged(rng: np.random.Generator, image: Rgb, strong: Ink) -> None:
+    height, width = image.shape[:2]
+    edge = int(rng.uniform(0.2, 0.34) * width)
+    image[:, :edge] = strong
+    for k in range(int(rng.integers(2, 5))):
+        emblem(rng, image, (edge / 2, (0.14 + 0.24 * k) * height), 0.36 * edge, ink(rng, saturation=0.2, value=0.9))
+    letter(image, word(rng), (edge + 0.05 * width, 0.17 * height), 0.1 * height, strong, font=SLANTED, bold=2)
+    box = (edge + 0.06 * width, 0.26 * height, 0.95 * width, 0.92 * height)
+    paragraph(rng, image, box, line_px=17, rgb=(60, 60, 60))
+
+
+def _illustrated(rng: np.random.Generator, image: Rgb, strong: Ink) -> None:
+    height, width = image.shape[:2]
+    photo = tinted(ink(rng, value=0.5), 34 * fractal(rng, (height // 2, width), cell_px=width / 3, octaves=5))
+    image[: height // 2] = photo
+    for _ in range(int(rng.integers(2, 6))):
+        where = (float(rng.uniform(0.1, 0.9)) * width, float(rng.uniform(0.1, 0.4)) * height)
+        emblem(rng, image, where, float(rng.uniform(0.06, 0.16)) * width, ink(rng))
+    letter(image, f"{word(rng)} {word(rng)}", (0.06 * width, 0.64 * height), 0.07 * height, strong, bold=2)
+    paragraph(rng, image, (0.06 * width, 0.7 * height, 0.94 * width, 0.95 * height), line_px=15, rgb=(40, 40, 60))
+
+
+def _numbered(rng: np.random.Generator, image: Rgb, strong: Ink) -> None:
+    height, width = image.shape[:2]
+    image[:] = strong
+    letter(image, str(rng.integers(10, 99)), (0.1 * width, 0.5 * height), 0.34 * height, (250, 240, 210), bold=9)
+    for k in range(3):
+        letter(image, word(rng), (0.1 * width, (0.66 + 0.12 * k) * height), 0.06 * height, (240, 240, 240), bold=2)
+    cv2.rectangle(image, (4, 4), (width - 5, height - 5), (235, 230, 215), 3)
 
 
 def pinboard(rng: np.random.Generator, size: tuple[int, int], *, base: ArrayLike, sheets: int) -> Rgb:
