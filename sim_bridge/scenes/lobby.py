@@ -32,7 +32,7 @@ from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_f
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 12.4, 9.0, 3.9
 WAITING_X, GATES_Y = 4.4, 6.3
-_PX_PER_M = 110
+_PX_PER_M, _FLOOR_PX_PER_M = 110, 130
 _WINDOW_POWER, _LAMP_POWER, _SPOT_POWER = 9.0, 2.6, 1.2
 
 Line = tuple[tuple[float, float], tuple[float, float]]
@@ -97,10 +97,12 @@ def _walls(build: Builder, rng: np.random.Generator) -> None:
 
 
 def _floor(build: Builder, rng: np.random.Generator) -> None:
-    floor = build.texture(prints.stone(rng, (360, 360), base=np.array([176, 172, 164]) + rng.normal(0, 4, 3)))
+    size = (round(WIDTH_M * _FLOOR_PX_PER_M), round(LENGTH_M * _FLOOR_PX_PER_M))
+    tone = np.array([172, 168, 160]) + rng.normal(0, 4, 3)
+    floor = build.texture(prints.terrazzo(rng, size, base=tone, px_per_m=_FLOOR_PX_PER_M))
     above = build.texture(office_prints.ceiling_tiles(rng, (288, 288), px_per_m=120))
     whole = (0.0, 0.0, LENGTH_M, WIDTH_M)
-    slab(build, whole, z_m=0.0, texture=floor, up=True, cell_m=0.13, tile_m=(2.4, 2.4))
+    slab(build, whole, z_m=0.0, texture=floor, up=True, cell_m=0.13)
     slab(build, whole, z_m=HEIGHT_M, texture=above, up=False, cell_m=0.6, tile_m=(2.4, 2.4))
     mat = build.texture(prints.mat((240, 560)))
     spot = Pose.from_components([6.3, 0.95, 0.004], Rotation.identity())
@@ -132,6 +134,11 @@ def _hang(
     hang(build, on_wall(wall_frame(*line, at_m), 0.0, up_m, off_m=0.0), size_m, image, name=name)
 
 
+def _picture(rng: np.random.Generator, size_m: tuple[float, float]) -> textures.Rgb:
+    kind = str(rng.choice(list(textures.PICTURES)))
+    return textures.PICTURES[kind](rng, px(size_m))
+
+
 def _reception(build: Builder, rng: np.random.Generator, look: Make) -> None:
     place = yaw_pose([2.35, 3.65, 0.0], -np.pi / 2)
     furniture.counter(build, rng, look, place, length_m=2.7)
@@ -141,8 +148,8 @@ def _reception(build: Builder, rng: np.random.Generator, look: Make) -> None:
     size = (2.2, 0.6)
     image = prints.logo(rng, px(size, px_per_m=250), base=(226, 223, 216))
     _hang(build, _WEST, WIDTH_M - 3.6, size, image, up_m=2.1, name="logo")
-    size = (0.5, 0.7)
-    _hang(build, _WEST, WIDTH_M - 5.6, size, textures.page(rng, px(size)), up_m=1.45)
+    for y, size in ((5.6, (0.6, 0.84)), (1.3, (0.8, 1.1))):
+        _hang(build, _WEST, WIDTH_M - y, size, _picture(rng, size), up_m=1.5)
 
 
 def _gates_and_lifts(build: Builder, rng: np.random.Generator, look: Make) -> None:
@@ -155,9 +162,14 @@ def _gates_and_lifts(build: Builder, rng: np.random.Generator, look: Make) -> No
         furniture.lift(build, look, wall_frame(*_NORTH, LENGTH_M - x))
     size = (0.8, 1.1)
     _hang(build, _NORTH, LENGTH_M - 11.75, size, prints.directory(rng, px(size)), up_m=1.55, name="directory")
-    size = (0.7, 0.95)
+    for x in (7.4, 9.4):
+        size = (0.45, 0.64)
+        _hang(build, _NORTH, LENGTH_M - x, size, _picture(rng, size), up_m=1.85)
+    size = (0.8, 1.1)
     back = wall_frame(*_WAITING_EAST, 1.5, side="right")
     hang(build, on_wall(back, 0.0, 1.45, off_m=0.0), size, textures.chart(rng, px(size)))
+    size = (0.9, 0.65)
+    _hang(build, _EAST, 7.9, size, _picture(rng, size), up_m=1.6)
 
 
 def _seats(build: Builder, rng: np.random.Generator, look: Make) -> None:
@@ -180,16 +192,21 @@ def _boards(build: Builder, rng: np.random.Generator, look: Make) -> None:
     for i, (x, y, yaw) in enumerate(spots):
         kinds = [textures.PICTURES[str(k)] for k in rng.choice(list(textures.PICTURES), 2)]
         front = kinds[0](rng, px((0.94, 1.34), px_per_m=320))
-        back = kinds[1](rng, px((0.94, 1.34), px_per_m=320)) if i == 1 else None
+        back = kinds[1](rng, px((0.94, 1.34), px_per_m=320)) if i != 2 else None
         spot = yaw_pose([x, y, 0.0], yaw + float(rng.normal(0, 0.15)))
         furniture.display(build, look, spot, front, back)
     furniture.rack(build, rng, look, wall_frame(*_SOUTH, 1.9))
     furniture.kiosk(build, rng, look, yaw_pose([4.3, 5.95, 0.0], np.pi))
     size = (1.9, 1.3)
     _hang(build, _EAST, 4.9, size, prints.painting(rng, px(size, px_per_m=300)), up_m=1.75, name="painting")
-    size = (0.6, 0.85)
-    _hang(build, _SOUTH, 10.9, size, textures.photo(rng, px(size)), up_m=1.5)
-    size = (0.5, 0.7)
+    size = (0.7, 0.95)
+    _hang(build, _SOUTH, 10.4, size, textures.photo(rng, px(size)), up_m=1.5)
+    for at in (1.3, 2.6):
+        size = (0.6, 0.84)
+        _hang(build, _EAST, at, size, _picture(rng, size), up_m=1.65)
+    for x, y, yaw in ((5.3, 5.0, 0.2), (9.6, 5.1, -0.3), (7.0, 2.1, 1.4), (3.0, 2.0, 1.9), (8.4, 7.9, 1.57)):
+        furniture.banner(build, rng, look, yaw_pose([x, y, 0.0], yaw), ceiling_m=HEIGHT_M)
+    size = (0.6, 0.84)
     hang(
         build,
         on_wall(wall_frame(*_WAITING_SOUTH, 1.2, side="right"), 0.0, 1.5, off_m=0.0),
@@ -204,6 +221,8 @@ def _waiting_room(build: Builder, rng: np.random.Generator, look: Make) -> None:
         furniture.armchair(build, look, yaw_pose([0.48, y, 0.0], np.pi / 2 + float(rng.normal(0, 0.1))))
     size = (1.1, 0.75)
     _hang(build, _WEST, WIDTH_M - 7.4, size, office_prints.cork(rng, px(size)), up_m=1.5, name="notices")
-    size = (0.65, 0.9)
-    _hang(build, _WAITING_EAST, 1.6, size, textures.shapes(rng, px(size)), up_m=1.5)
+    size = (0.75, 1.0)
+    _hang(build, _WAITING_EAST, 1.2, size, textures.shapes(rng, px(size)), up_m=1.5)
+    size = (0.6, 0.84)
+    _hang(build, _WAITING_SOUTH, 1.5, size, _picture(rng, size), up_m=1.5)
     furniture.kiosk(build, rng, look, yaw_pose([3.4, 8.5, 0.0], np.pi + 0.2))

@@ -161,6 +161,20 @@ def display(build: Builder, look: Make, place: Pose, front: Rgb, back: Rgb | Non
         build.block(place, (1.08, 0.5))
 
 
+def banner(build: Builder, rng: np.random.Generator, look: Make, place: Pose, *, ceiling_m: float) -> None:
+    """Hang a banner of 0.8 x 1.5 m from the ceiling, printed differently on its two sides, which faces +y."""
+    size = (0.8, 1.5)
+    up = ceiling_m - 0.35 - size[1] / 2
+    with build.thing("banner", place, kind="picture"):
+        for z in (up + size[1] / 2, up - size[1] / 2):
+            build.box(place, [0.0, 0.0, z], [size[0] + 0.06, 0.02, 0.02], look.dark, solid=False)
+        for x in (-0.35, 0.35):
+            build.box(place, [x, 0.0, ceiling_m - 0.17], [0.008, 0.008, 0.34], look.dark, solid=False)
+        for yaw in (0.0, np.pi):
+            image = build.texture(prints.banner(rng, px(size, px_per_m=300)))
+            build.panel(on_wall(moved(place, yaw_rad=yaw), 0.0, up, off_m=0.002), size, image, solid=False)
+
+
 def rack(build: Builder, rng: np.random.Generator, look: Make, place: Pose) -> None:
     """Add a rack of leaflets against a wall: four stepped rows, 0.8 m wide, 1.5 m high."""
     with build.thing("rack", place):

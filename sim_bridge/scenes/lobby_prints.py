@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sim_bridge.scenes import textures
+from sim_bridge.scenes.office_prints import flecked
 from sim_bridge.scenes.textures import Rgb, colour, fractal, tinted, write_lines
 
 Size = tuple[int, int]
@@ -31,13 +32,15 @@ def cladding(
     return tinted(base, image)
 
 
-def stone(rng: np.random.Generator, size: Size, *, base: ArrayLike) -> Rgb:
-    """Draw 4 x 4 polished floor slabs with faint clouds and thin joints."""
+def terrazzo(rng: np.random.Generator, size: Size, *, base: ArrayLike, px_per_m: float) -> Rgb:
+    """Draw slabs of polished terrazzo of 0.6 m with chips of stone and thin joints."""
     height, width = size
-    image = 1.6 * fractal(rng, size, cell_px=height / 5, octaves=4)
-    for i in range(4):
-        image[height * i // 4], image[:, width * i // 4] = -22, -22
-    return tinted(base, image)
+    ground = tinted(base, 2.0 * fractal(rng, size, cell_px=0.8 * px_per_m, octaves=4))
+    image = flecked(rng, ground, count=int(45 * height * width / px_per_m**2), px_per_m=px_per_m, contrast=16.0)
+    for at in np.arange(0, max(size), 0.6 * px_per_m).astype(int):
+        image[at : at + 1] = image[at : at + 1] // 8 * 7
+        image[:, at : at + 1] = image[:, at : at + 1] // 8 * 7
+    return image
 
 
 def mat(size: Size) -> Rgb:
@@ -111,6 +114,23 @@ def painting(rng: np.random.Generator, size: Size) -> Rgb:
     for _ in range(14):
         spot = (int(rng.uniform(0, width)), int(rng.uniform(0, height)))
         cv2.circle(image, spot, int(rng.uniform(0.01, 0.05) * height), colour(rng), -1, cv2.LINE_AA)
+    return image
+
+
+def banner(rng: np.random.Generator, size: Size) -> Rgb:
+    """Draw a long banner: a mark at its top, a picture, a few large words."""
+    height, width = size
+    image = np.empty((height, width, 3), np.uint8)
+    image[:] = colour(rng, low=90, high=240)
+    top = int(height * rng.uniform(0.25, 0.35))
+    disc = (width // 2, top // 2)
+    for i in range(4):
+        cv2.circle(image, disc, int(0.42 * top * (1 - i / 4)), colour(rng), -1, cv2.LINE_AA)
+    kind = textures.photo if rng.random() < 0.5 else textures.shapes
+    picture = kind(rng, (int(0.4 * height), width))
+    image[top : top + len(picture)] = picture
+    box = (width // 14, top + len(picture), width - width // 14, height - 4)
+    write_lines(rng, image, box, line_px=max(height // 22, 9))
     return image
 
 

@@ -33,7 +33,8 @@ from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_f
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 14.9, 11.0, 2.7
 KITCHEN_X, CORRIDOR_Y, ROOMS_Y = 11.4, 6.2, 7.7
-_PX_PER_M = 110
+_PX_PER_M, _FLOOR_PX_PER_M = 110, 120
+_DOWN = Rotation.from_euler("x", np.pi)
 _WINDOW_POWER, _LAMP_POWER = 3.0, 4.2
 
 
@@ -82,7 +83,8 @@ def office(seed: int) -> Blueprint:
     look = furniture.style(build, rng)
     paints = _paints(build, rng)
     _shell(build, rng, paints)
-    _ceiling(build, rng)
+    _floors(build, rng)
+    _ceilings(build, rng)
     _open_plan(build, rng, look)
     _corridor(build, rng, look)
     for i, room in enumerate(rng.permutation(2)):
@@ -143,27 +145,39 @@ def _shell(build: Builder, rng: np.random.Generator, paints: Paints) -> None:
         put(Line((x, ROOMS_Y), (x, WIDTH_M)), paints.plain, paints.accent if x > 5 else paints.plain)
 
 
-def _ceiling(build: Builder, rng: np.random.Generator) -> None:
-    """Add floors, ceilings and lamps, which are alike everywhere."""
-    tone = np.array(((96, 100, 106), (112, 104, 96), (88, 98, 100))[int(rng.integers(3))])
-    carpet = build.texture(prints.carpet_tiles(rng, (300, 300), base=tone))
-    tiles = build.texture(prints.wall_tiles(rng, (300, 300), base=(188, 184, 176), tile_px=50))
-    panels = build.texture(prints.ceiling_tiles(rng, (288, 288), px_per_m=120))
+def _rooms() -> list[tuple[float, float, float, float]]:
+    """Return the rooms' rectangles: open plan, corridor, kitchenette, then the rooms behind."""
     rooms = [(0.0, 0.0, KITCHEN_X, CORRIDOR_Y), (0.0, CORRIDOR_Y, LENGTH_M, ROOMS_Y)]
-    rooms += [(a, ROOMS_Y, b, WIDTH_M) for a, b in itertools.pairwise(_ROOM_XS)]
-    kitchen = (KITCHEN_X, 0.0, LENGTH_M, CORRIDOR_Y)
-    for rect in (*rooms, kitchen):
-        floor = tiles if rect is kitchen else carpet
-        slab(build, rect, z_m=0.0, texture=floor, up=True, cell_m=0.13, tile_m=(2.0, 2.0))
+    rooms.append((KITCHEN_X, 0.0, LENGTH_M, CORRIDOR_Y))
+    return rooms + [(a, ROOMS_Y, b, WIDTH_M) for a, b in itertools.pairwise(_ROOM_XS)]
+
+
+def _floors(build: Builder, rng: np.random.Generator) -> None:
+    tone = np.array(((96, 100, 106), (112, 104, 96), (88, 98, 100))[int(rng.integers(3))])
+    for i, (x0, y0, x1, y1) in enumerate(_rooms()):
+        size = (round((y1 - y0) * _FLOOR_PX_PER_M), round((x1 - x0) * _FLOOR_PX_PER_M))
+        if i == 2:
+            image = textures.planks(rng, size, px_per_m=_FLOOR_PX_PER_M)
+        else:
+            image = prints.carpet(rng, size, base=tone, px_per_m=_FLOOR_PX_PER_M)
+        slab(build, (x0, y0, x1, y1), z_m=0.0, texture=build.texture(image), up=True, cell_m=0.13)
+
+
+def _ceilings(build: Builder, rng: np.random.Generator) -> None:
+    """Add ceilings and lamps, which are alike everywhere, and vents, of which each looks like the other."""
+    panels = build.texture(prints.ceiling_tiles(rng, (288, 288), px_per_m=120))
+    vent = build.texture(prints.grille((96, 96)))
+    for rect, (across, down) in zip(_rooms(), ((4, 3), (5, 1), (2, 2), (2, 1), (2, 1), (2, 1)), strict=True):
         slab(build, rect, z_m=HEIGHT_M, texture=panels, up=False, cell_m=0.6, tile_m=(2.4, 2.4))
-    for row in ((rooms[0], 4, 3), (rooms[1], 5, 1), (kitchen, 2, 2), *((r, 2, 1) for r in rooms[2:])):
-        rect, across, down = row
+        wide, deep = (rect[2] - rect[0]) / across, (rect[3] - rect[1]) / down
         for i in range(across):
             for j in range(down):
-                x = rect[0] + (rect[2] - rect[0]) * (i + 0.5) / across
-                y = rect[1] + (rect[3] - rect[1]) * (j + 0.5) / down
-                under = Pose.from_components([x, y, HEIGHT_M - 0.01], Rotation.from_euler("x", np.pi))
+                x, y = rect[0] + wide * (i + 0.5), rect[1] + deep * (j + 0.5)
+                under = Pose.from_components([x, y, HEIGHT_M - 0.01], _DOWN)
                 build.lamp(under, (1.2, 0.3), power=_LAMP_POWER, samples=(1, 1))
+                if rng.random() < 0.3:
+                    beside = Pose.from_components([x + 0.35 * wide, y, HEIGHT_M - 0.004], _DOWN)
+                    build.panel(beside, (0.58, 0.58), vent, solid=False)
 
 
 def _picture(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
@@ -173,66 +187,73 @@ def _picture(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
 
 def _poster(build: Builder, rng: np.random.Generator, place: Pose, *, large: float = 1.0) -> None:
     """Hang a poster on a wall's frame, at eye height or a little lower."""
-    width = large * float(rng.uniform(0.5, 0.8))
+    width = large * float(rng.uniform(0.55, 0.8))
     size = (width, width * float(rng.uniform(1.0, 1.4)))
     at = on_wall(place, 0.0, float(rng.uniform(1.35, 1.55)), off_m=0.0)
     hang(build, at, size, _picture(rng, size))
 
 
+def _board(build: Builder, rng: np.random.Generator, place: Pose, *, width_m: float, up_m: float = 1.5) -> None:
+    """Hang a notice board on a wall's frame."""
+    size = (width_m, 0.66 * width_m)
+    hang(build, on_wall(place, 0.0, up_m, off_m=0.0), size, prints.cork(rng, px(size)), name="notices")
+
+
 def _open_plan(build: Builder, rng: np.random.Generator, look: Style) -> None:
     """Add three double rows of desks across the room, cupboards along its north wall, and what hangs on the walls."""
-    noted = rng.permutation(3)[:2]
-    for i, x in enumerate((2.25, 5.7, 9.15)):
+    for x in (2.25, 5.7, 9.15):
         place = yaw_pose([x, 2.92, 0.0], np.pi / 2)
         furniture.bench(build, rng, look, place, desks=2)
-        if i in noted:
-            outwards = moved(place, yaw_rad=float(rng.choice([-np.pi / 2, np.pi / 2])))
-            size = (0.6, 0.45)
-            end = on_wall(moved(outwards, y=1.656), float(rng.uniform(-0.4, 0.4)), 1.05, off_m=0.0)
-            hang(build, end, size, prints.cork(rng, px(size)), name="notices")
+        ends = [-np.pi / 2, np.pi / 2]
+        for yaw in ends if rng.random() < 0.4 else [float(rng.choice(ends))]:
+            outwards = moved(place, yaw_rad=yaw)
+            _board(build, rng, moved(outwards, float(rng.uniform(-0.35, 0.35)), 1.656), width_m=0.75, up_m=1.02)
     for i, x in enumerate(np.arange(3.6, 8.2, 0.9)):
         tall = i in (0, 1, 4)
-        furniture.cupboard(build, look, FRONT.right(float(x)), height_m=2.0 if tall else 1.1)
+        front = FRONT.right(float(x))
+        furniture.cupboard(build, look, front, height_m=2.0 if tall else 1.1)
         if not tall:
-            furniture.litter(build, rng, moved(FRONT.right(float(x)), y=0.22), (0.85, 0.5), up_m=1.1, count=2)
-    size = (1.5, 0.9)
-    hang(build, on_wall(FRONT.right(5.85), 0.0, 1.75, off_m=0.0), size, prints.cork(rng, px(size)), name="notices")
+            furniture.litter(build, rng, moved(front, y=0.22), (0.85, 0.5), up_m=1.1, count=3)
+        elif i != 1:
+            size = (0.5, 0.7)
+            up = float(rng.uniform(1.2, 1.5))
+            hang(build, on_wall(front, 0.0, up, off_m=0.45), size, _picture(rng, size))
+    _board(build, rng, FRONT.right(5.85), width_m=1.4, up_m=1.75)
     size = (1.6, 1.0)
-    hang(
-        build,
-        on_wall(WEST.left(WIDTH_M - 2.9), 0.0, 1.45, off_m=0.0),
-        size,
-        prints.whiteboard(rng, px(size)),
-        name="board",
-    )
-    _poster(build, rng, WEST.left(WIDTH_M - 1.0))
-    _poster(build, rng, KITCHEN.left(2.9), large=1.3)
+    board = on_wall(WEST.left(WIDTH_M - 2.9), 0.0, 1.45, off_m=0.0)
+    hang(build, board, size, prints.whiteboard(rng, px(size)), name="board")
+    for at in (WIDTH_M - 0.9, WIDTH_M - 4.6):
+        _poster(build, rng, WEST.left(at), large=1.1)
+    for x in (3.95, 7.4):
+        _poster(build, rng, SOUTH.left(x), large=1.2)
+    _poster(build, rng, KITCHEN.left(2.9), large=1.4)
     size = (1.1, 0.62)
-    hang(
-        build, on_wall(KITCHEN.left(1.3), 0.0, 1.5, off_m=0.03), size, textures.screen(rng, px(size)), name="television"
-    )
-    for at in ((10.95, 0.5), (0.5, 5.7)):
-        furniture.plant(build, rng, yaw_pose([*at, 0.0], float(rng.uniform(0, np.pi))))
+    image = textures.screen(rng, px(size))
+    hang(build, on_wall(KITCHEN.left(1.3), 0.0, 1.5, off_m=0.03), size, image, name="television")
+    for x, y, yaw in ((3.97, 1.6, 0.0), (7.4, 4.0, 0.0), (2.1, 5.4, np.pi / 2)):
+        furniture.hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw), ceiling_m=HEIGHT_M)
+    for x, y in ((10.95, 0.5), (0.5, 5.7)):
+        furniture.plant(build, rng, yaw_pose([x, y, 0.0], float(rng.uniform(0, np.pi))))
     furniture.bin_(build, yaw_pose([8.4, 5.9, 0.0], float(rng.uniform(0, np.pi))))
 
 
 def _corridor(build: Builder, rng: np.random.Generator, look: Style) -> None:
-    """Add closed doors of which each looks like the other, signs, and pictures in two places."""
-    for x in (3.3, 5.2, 13.2):
+    """Add closed doors of which each looks like the other, signs, and pictures here and there."""
+    for x in (3.3, 5.2, 13.1):
         furniture.door(build, look, BACK.right(x))
     for i, x in enumerate((1.95, 4.05, 7.0, 10.8)):
         size = (0.22, 0.16)
         text = f"{int(rng.integers(1, 4))}.{i + 11}"
         image = prints.sign(rng, px(size), text=text, base=(70, 78, 90))
         hang(build, on_wall(BACK.right(x), 0.0, 1.55, off_m=0.0), size, image, name="sign")
-    _poster(build, rng, BACK.right(6.3))
-    _poster(build, rng, FRONT.left(float(rng.uniform(3.6, 4.6))), large=1.2)
-    _poster(build, rng, FRONT.left(float(rng.uniform(10.6, 11.2))))
-    size = (1.2, 0.8)
-    hang(
-        build, on_wall(WEST.left(WIDTH_M - 6.95), 0.0, 1.5, off_m=0.0), size, prints.cork(rng, px(size)), name="notices"
-    )
-    _poster(build, rng, EAST.left(6.95), large=1.2)
+    for x in (2.5, 6.3, 11.7):
+        _poster(build, rng, BACK.right(x + float(rng.uniform(-0.1, 0.1))))
+    for x in (0.8, 4.1, 7.2, 11.0, 13.8):
+        _poster(build, rng, FRONT.left(x + float(rng.uniform(-0.2, 0.2))), large=float(rng.choice([1.0, 1.3])))
+    _board(build, rng, WEST.left(WIDTH_M - 6.95), width_m=1.2)
+    _poster(build, rng, EAST.left(6.95), large=1.3)
+    for x in (3.2, 8.6):
+        furniture.hanging_sign(build, rng, yaw_pose([x, 6.95, 0.0], np.pi / 2), ceiling_m=HEIGHT_M)
 
 
 def _single_office(build: Builder, rng: np.random.Generator, look: Style, *, x0: float, variant: int) -> None:
@@ -248,6 +269,7 @@ def _single_office(build: Builder, rng: np.random.Generator, look: Style, *, x0:
     furniture.cupboard(build, look, NORTH.left(LENGTH_M - (x1 - 0.6)))
     furniture.cupboard(build, look, outer, height_m=1.1)
     _poster(build, rng, moved(outer, float(rng.uniform(-0.2, 0.2))), large=1.1)
+    _poster(build, rng, BACK.left(x0 + 2.9))
     if variant == 0:
         size = (1.2, 0.8)
         hang(build, on_wall(inner, 0.2, 1.55, off_m=0.0), size, prints.whiteboard(rng, px(size)), name="board")
@@ -272,7 +294,8 @@ def _meeting_room(build: Builder, rng: np.random.Generator, look: Style) -> None
     size = (1.8, 1.1)
     divider = Line((8.8, ROOMS_Y), (8.8, WIDTH_M))
     hang(build, on_wall(divider.right(1.6), 0.0, 1.45, off_m=0.0), size, prints.whiteboard(rng, px(size)), name="board")
-    _poster(build, rng, BACK.left(12.6))
+    for x in (11.4, 12.6, 13.9):
+        _poster(build, rng, BACK.left(x), large=1.1)
 
 
 def _kitchenette(build: Builder, rng: np.random.Generator, look: Style) -> None:
@@ -285,7 +308,8 @@ def _kitchenette(build: Builder, rng: np.random.Generator, look: Style) -> None:
             near = moved(moved(spot, yaw_rad=yaw), float(rng.normal(0, 0.04)), 0.5)
             if rng.random() < 0.8:
                 furniture.seat(build, look, moved(near, yaw_rad=float(rng.normal(0, 0.2))))
-    size = (0.9, 0.6)
-    hang(build, on_wall(KITCHEN.right(4.4), 0.0, 1.5, off_m=0.0), size, prints.cork(rng, px(size)), name="notices")
+    _board(build, rng, KITCHEN.right(3.9), width_m=1.1)
+    _poster(build, rng, KITCHEN.right(1.6), large=1.2)
+    _poster(build, rng, SOUTH.left(12.2))
     size = (0.45, 0.7)
     hang(build, on_wall(FRONT.right(13.6), 0.0, 1.5, off_m=0.0), size, prints.calendar(rng, px(size)), name="calendar")

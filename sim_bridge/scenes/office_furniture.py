@@ -137,15 +137,21 @@ def monitor(build: Builder, look: Style, place: Pose, image: int) -> None:
 def screen_image(build: Builder, rng: np.random.Generator) -> int:
     """Return what a screen shows: nothing, the common login, or someone's work."""
     kind = rng.random()
-    if kind < 0.3:
+    if kind < 0.2:
         return build.shared("screen off", lambda: np.full((1, 1, 3), (20, 21, 24), np.uint8))
-    if kind < 0.65:
+    if kind < 0.4:
         return build.shared("login", lambda: office_prints.login((150, 260)))
     return build.texture(textures.screen(rng, (180, 300)))
 
 
-def workplace(build: Builder, rng: np.random.Generator, look: Style, place: Pose) -> None:
-    """Add a desk with a screen, a keyboard, a chair and someone's things."""
+def pinned_print(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
+    """Draw what people pin up: a notice, a photograph, a drawing, a chart."""
+    kind = str(rng.choice(list(textures.PICTURES)))
+    return textures.PICTURES[kind](rng, px(size_m))
+
+
+def workplace(build: Builder, rng: np.random.Generator, look: Style, place: Pose, *, pinned: bool = False) -> None:
+    """Add a desk with a screen, a keyboard, a chair and someone's things; ``pinned`` prints hang behind it."""
     desk(build, look, place)
     x = float(rng.uniform(-0.25, 0.05))
     top = DESK_TOP_M
@@ -154,7 +160,14 @@ def workplace(build: Builder, rng: np.random.Generator, look: Style, place: Pose
     at = moved(place, x, 0.5, top, yaw_rad=float(rng.normal(0, 0.05)))
     with build.thing("keyboard", at):
         build.box(at, [0.0, 0.0, 0.01], [0.43, 0.14, 0.02], look.dark, sides={4: keys}, solid=False)
-    litter(build, rng, moved(place, y=0.4), (1.5, 0.7), up_m=top, count=int(rng.choice([0, 1, 1, 2, 5])))
+    litter(build, rng, moved(place, y=0.4), (1.5, 0.7), up_m=top, count=int(rng.choice([1, 2, 3, 4, 6])))
+    if pinned:
+        for side in (-1, 1):
+            if rng.random() < 0.75:
+                size = (float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.28, 0.4)))
+                along = float(np.clip(x + side * 0.48, -0.54, 0.54))
+                spot = on_wall(place, along, 1.04, off_m=-0.01)
+                hang(build, spot, size, pinned_print(rng, size), name="pinned")
     back = moved(place, float(rng.normal(0, 0.1)), 0.8, yaw_rad=float(rng.normal(0, 0.3)))
     chair(build, look, back)
 
@@ -197,7 +210,7 @@ def bench(build: Builder, rng: np.random.Generator, look: Style, place: Pose, *,
     for yaw in (0.0, np.pi):
         for i in range(desks):
             at = moved(moved(place, yaw_rad=yaw), (i - (desks - 1) / 2) * w, 0.03)
-            workplace(build, rng, look, at)
+            workplace(build, rng, look, at, pinned=True)
 
 
 def cupboard(build: Builder, look: Style, place: Pose, *, width_m: float = 0.9, height_m: float = 2.0) -> None:
@@ -217,9 +230,9 @@ def cupboard(build: Builder, look: Style, place: Pose, *, width_m: float = 0.9, 
 
 
 def bookcase(build: Builder, rng: np.random.Generator, look: Style, place: Pose, *, width_m: float = 0.9) -> None:
-    """Add an open shelf of 1.9 m with rows of folders, of which there are only three sorts."""
+    """Add an open shelf of 1.9 m with rows of folders, of which there are only three sorts, and one row of books."""
     height, depth, board, rows = 1.9, 0.36, 0.025, 5
-    step = (height - board) / rows
+    step, books = (height - board) / rows, int(rng.integers(2, 5))
     with build.thing("bookcase", place, kind="fixed"):
         for side in (-1, 1):
             build.box(place, [side * (width_m - board) / 2, depth / 2, height / 2], [board, depth, height], look.board)
@@ -231,7 +244,10 @@ def bookcase(build: Builder, rng: np.random.Generator, look: Style, place: Pose,
                 break
             share = float(rng.choice([0.55, 0.8, 1.0]))
             sort = int(rng.integers(3))
-            row = build.shared(("folders", sort), lambda: office_prints.binders(rng, (110, 300), count=11))
+            if i == books:
+                row = build.texture(office_prints.binders(rng, (110, 300), count=int(rng.integers(15, 22))))
+            else:
+                row = build.shared(("folders", sort), lambda: office_prints.binders(rng, (110, 300), count=11))
             wide = share * (width_m - 2 * board - 0.02)
             x = -(width_m - 2 * board - 0.02 - wide) / 2
             top = look.dark
@@ -256,6 +272,22 @@ def plant(build: Builder, rng: np.random.Generator, place: Pose, *, height_m: fl
             leaf = place * Pose.from_components(middle, turn)
             build.panel(leaf, (0.07, length), greens[int(rng.integers(3))], solid=False)
         build.block(place, (0.62, 0.62))
+
+
+def hanging_sign(build: Builder, rng: np.random.Generator, place: Pose, *, ceiling_m: float) -> None:
+    """Hang a sign of 1.2 x 0.35 m from the ceiling, written on both sides, which faces +y."""
+    size = (1.2, 0.35)
+    up = ceiling_m - 0.3
+    with build.thing("hanging sign", place, kind="picture"):
+        rim = build.shared("sign rim", lambda: np.full((1, 1, 3), (48, 50, 54), np.uint8))
+        build.box(place, [0.0, 0.0, up], [size[0] + 0.02, 0.02, size[1] + 0.02], rim, solid=False)
+        for x in (-0.5, 0.5):
+            build.box(place, [x, 0.0, ceiling_m - 0.06], [0.012, 0.012, 0.12], rim, solid=False)
+        base = textures.colour(rng, low=40, high=140)
+        letters = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVW"), 7))
+        image = build.texture(office_prints.sign(rng, px(size, px_per_m=240), text=letters, base=base))
+        for yaw in (0.0, np.pi):
+            build.panel(on_wall(moved(place, yaw_rad=yaw), 0.0, up, off_m=0.012), size, image, solid=False)
 
 
 def bin_(build: Builder, place: Pose) -> None:

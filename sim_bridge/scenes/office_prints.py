@@ -27,16 +27,25 @@ def stripes(rng: np.random.Generator, size: Size, *, base: ArrayLike, px_per_m: 
     return tinted(base, (fractal(rng, size, cell_px=size[0] / 2, octaves=2) + soft[None]).astype(np.float32))
 
 
-def carpet_tiles(rng: np.random.Generator, size: Size, *, base: ArrayLike) -> Rgb:
-    """Draw a square of 2 x 2 m of carpet tiles of 0.5 m, turned in turn; it repeats without a seam of its own."""
+def carpet(rng: np.random.Generator, size: Size, *, base: ArrayLike, px_per_m: float) -> Rgb:
+    """Draw carpet tiles of 0.5 m, turned in turn, worn and flecked."""
     height, width = size
-    image = 2.2 * fractal(rng, size, cell_px=3, octaves=2)
-    for row in range(4):
-        for col in range(4):
-            part = (slice(height * row // 4, height * (row + 1) // 4), slice(width * col // 4, width * (col + 1) // 4))
-            image[part] += 2.0 if (row + col) % 2 else -2.0
-            image[part[0].start], image[:, part[1].start] = image[part[0].start] - 3, image[:, part[1].start] - 3
-    return tinted(base, image)
+    rows, cols = (np.arange(n) // (0.5 * px_per_m) % 2 for n in size)
+    image = 2.0 * fractal(rng, size, cell_px=3, octaves=1) + 4.0 * fractal(rng, size, cell_px=0.6 * px_per_m, octaves=5)
+    image += 2.5 * np.where(rows[:, None] == cols[None], 1.0, -1.0).astype(np.float32)
+    return flecked(rng, tinted(base, image), count=int(22 * height * width / px_per_m**2), px_per_m=px_per_m)
+
+
+def flecked(rng: np.random.Generator, image: Rgb, *, count: int, px_per_m: float, contrast: float = 22.0) -> Rgb:
+    """Strew flecks of 1 to 5 cm over an image, a little lighter or darker than the ground."""
+    height, width = image.shape[:2]
+    ground = image.reshape(-1, 3).mean(axis=0)
+    for x, y in rng.uniform((0, 0), (width, height), (count, 2)):
+        axes = np.maximum(rng.uniform(0.005, 0.025, 2) * px_per_m, 1.0)
+        tone = np.clip(ground + rng.normal(0.0, contrast) + rng.normal(0.0, 5.0, 3), 0, 255)
+        ink = [int(v) for v in tone]
+        cv2.ellipse(image, ((x, y), (2 * axes[0], 2 * axes[1]), rng.uniform(0, 180)), ink, -1, cv2.LINE_AA)
+    return image
 
 
 def ceiling_tiles(rng: np.random.Generator, size: Size, *, px_per_m: float) -> Rgb:
@@ -203,6 +212,15 @@ def sign(rng: np.random.Generator, size: Size, *, text: str, base: ArrayLike) ->
     scale *= min(1.0, 0.9 * width / max(wide, 1))
     spot = (int(0.05 * width), int(0.62 * height))
     cv2.putText(image, text, spot, cv2.FONT_HERSHEY_DUPLEX, scale, (245, 245, 240), max(1, height // 26), cv2.LINE_AA)
+    return image
+
+
+def grille(size: Size) -> Rgb:
+    """Draw the slots of an air vent."""
+    image = np.full((*size, 3), 214, np.uint8)
+    step = max(size[0] // 10, 3)
+    for y in range(step, size[0] - step, step):
+        image[y : y + step // 2, size[1] // 10 : -size[1] // 10] = 70
     return image
 
 
