@@ -10,6 +10,8 @@ from fieldkit.features import Descriptors
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
+# Queries whose products with all stored descriptors are looked at together.
+_BLOCK = 256
 
 
 def match_pair(first: Descriptors, second: Descriptors, *, ratio: float) -> NDArray[np.uint32]:
@@ -42,7 +44,7 @@ def match_groups(
     empty = np.zeros(0, dtype=np.int32)
     if not len(query) or not len(stored):
         return empty, empty, np.zeros(0, dtype=np.float32)
-    best, best_distance, other_distance = _nearest_groups(_squared_distances(query, stored), group)
+    best, best_distance, other_distance = _nearest_blockwise(query, stored, group)
     kept = np.flatnonzero(best_distance < np.float32(ratio * ratio) * other_distance)
     order = kept[np.lexsort((kept, best_distance[kept], group[best[kept]]))]
     groups = group[best[order]]
@@ -50,6 +52,23 @@ def match_groups(
     first[1:] = groups[1:] != groups[:-1]
     chosen = np.sort(order[first])
     return chosen.astype(np.int32), group[best[chosen]], best_distance[chosen]
+
+
+def _nearest_blockwise(query: Descriptors, stored: Descriptors, group: Ints) -> tuple[Ints, Floats, Floats]:
+    """Return per query the nearest stored descriptor, its squared distance, and that of the nearest of other groups.
+
+    A block of products stays in the processor's cache; the whole table would go through memory four times.
+    """
+    a, b = np.asarray(query, dtype=np.float32), np.asarray(stored, dtype=np.float32)
+    a_squares, b_squares = np.einsum("ij,ij->i", a, a), np.einsum("ij,ij->i", b, b)
+    best = np.zeros(len(a), dtype=np.int32)
+    nearest, other = np.empty(len(a), dtype=np.float32), np.empty(len(a), dtype=np.float32)
+    products = np.empty((min(_BLOCK, len(a)), len(b)), dtype=np.float32)
+    for begin in range(0, len(a), _BLOCK):
+        rows = slice(begin, min(begin + _BLOCK, len(a)))
+        block = np.matmul(a[rows], b.T, out=products[: rows.stop - begin])
+        _nearest_groups(block, a_squares[rows], b_squares, group, best[rows], nearest[rows], other[rows])
+    return best, nearest, other
 
 
 def _squared_distances(first: Descriptors, second: Descriptors) -> Floats:
@@ -146,19 +165,19 @@ def _mutual_bytes(first, second, squared_ratio):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest_groups(distance, group):  # type: ignore[no-untyped-def]
-    """Return per row the nearest column, its distance, and the nearest distance among columns of other groups."""
-    n, m = distance.shape
-    best = np.zeros(n, dtype=np.int32)
-    nearest = np.full(n, np.inf, dtype=np.float32)
-    other = np.full(n, np.inf, dtype=np.float32)
+def _nearest_groups(product, row_squares, column_squares, group, best, nearest, other):  # type: ignore[no-untyped-def]
+    """Fill per row the nearest column, its distance, and the nearest distance among columns of other groups.
+
+    ``product`` holds the dot products of rows and columns.
+    """
+    n, m = product.shape
     for i in range(n):
         first = np.float32(np.inf)
         second = np.float32(np.inf)
         index = 0
         owner = -1
         for j in range(m):
-            d = distance[i, j]
+            d = np.float32(-2.0) * product[i, j] + row_squares[i] + column_squares[j]
             if d < second:
                 if group[j] == owner:
                     if d < first:
@@ -174,4 +193,3 @@ def _nearest_groups(distance, group):  # type: ignore[no-untyped-def]
         best[i] = index
         nearest[i] = first
         other[i] = second
-    return best, nearest, other
