@@ -34,6 +34,7 @@ from sim_bridge.rendering import render
 from sim_bridge.scenes import SCENES, make_blueprint
 from sim_bridge.scenes.blueprint import Blueprint
 from sim_bridge.scenes.changes import STANDARD_CHANGES, ChangeOptions, find_changes, mapped_scene, visited_scene
+from sim_bridge.scenes.light import unlit
 from sim_bridge.sensors import STANDARD, Motion, Sensors, bent, encode, expose, load_sensors
 from sim_bridge.stage.lookouts import Lookout, LookoutOptions, find_lookouts
 
@@ -103,11 +104,18 @@ class SceneSource:
         return find_lookouts(self._scene, self.options.lookouts, rng=_generator(self.options.seed, 21))
 
     @functools.cached_property
+    def _stations(self) -> tuple[mapper.Station, ...]:
+        return mapper.walk(unlit(self._blueprint), self.options.walk, rng=_generator(self.options.seed, 1))
+
+    @functools.cached_property
     def mapping_key(self) -> str:
-        """Digest of the scene and of all that its mapping depends on."""
+        """Digest of the scene, of the walk, and of all else that the mapping depends on."""
         o = self.options
         sensors = (o.sensors.mapping, o.sensors.mapping_depth)
-        return digest(blueprint_digest(self._blueprint), repr((MAPPING_VERSION, o.seed, o.walk, sensors)))
+        places = [
+            s.world_from_rig.as_matrix().tobytes() + s.slam_from_rig.as_matrix().tobytes() for s in self._stations
+        ]
+        return digest(blueprint_digest(self._blueprint), repr((MAPPING_VERSION, o.seed, o.walk, sensors)), *places)
 
     @functools.cached_property
     def views_key(self) -> str:
@@ -119,9 +127,8 @@ class SceneSource:
 
     def write_mapping(self, folder: Path) -> Mapping[str, Pose]:
         """Write the mapping walk through the scene as it was; return world_from_cam by image name."""
-        options, sensors, seed = self.options.walk, self.options.sensors, self.options.seed
+        sensors, seed, stations = self.options.sensors, self.options.seed, self._stations
         scene = mapped_scene(self._blueprint, seed=seed)
-        stations = mapper.walk(scene, options, rng=_generator(seed, 1))
         write_rig(folder / "rig.toml", mapper.hololens_rig(sensors.mapping))
         write_tum(folder / "slam_poses.txt", [(s.frame, s.slam_from_rig) for s in stations])
         true = {}

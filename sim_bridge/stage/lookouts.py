@@ -16,8 +16,7 @@ from sim_bridge import robot
 from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Scene
 from sim_bridge.stage.paths import FloorGraph, floor_graph
-from sim_bridge.stage.tours import _round_trip as round_trip
-from sim_bridge.stage.tours import largest_part
+from sim_bridge.stage.tours import largest_part, round_trip
 
 Array = NDArray[np.float64]
 

@@ -123,7 +123,7 @@ def _stops(graph: FloorGraph, reach_m: float) -> NDArray[np.intp]:
 def _loop(graph: FloorGraph, stops: NDArray[np.intp]) -> Array:
     """Return the cells (n, 2) of a short closed walk through all stops."""
     cost, previous = dijkstra(graph.steps, directed=False, indices=stops, return_predecessors=True)
-    order = _round_trip(cost[:, stops])
+    order = round_trip(cost[:, stops])
     cells: list[int] = []
     for k, first in enumerate(order):
         last = order[(k + 1) % len(order)]
@@ -134,7 +134,7 @@ def _loop(graph: FloorGraph, stops: NDArray[np.intp]) -> Array:
     return graph.centres[cells]
 
 
-def _round_trip(cost: Array) -> list[int]:
+def round_trip(cost: Array) -> list[int]:
     """Return the order of a short round trip: cheapest insertion, then turning stretches around while it helps."""
     count = len(cost)
     trip, rest = [0], set(range(1, count))
