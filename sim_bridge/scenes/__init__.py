@@ -18,6 +18,7 @@ from sim_bridge.scenes.museum import museum
 from sim_bridge.scenes.office import office
 from sim_bridge.scenes.room import furnished_room
 from sim_bridge.scenes.school import school
+from sim_bridge.scenes.shop import shop
 
 __all__ = ["SCENES", "make_blueprint", "make_scene"]
 
@@ -26,6 +27,7 @@ SCENES: dict[str, Callable[[int], Blueprint]] = {
     "room": furnished_room,
     "office": office,
     "lobby": lobby,
+    "shop": shop,
     "library": library,
     "clinic": clinic,
     "school": school,

@@ -1,0 +1,167 @@
+"""The shop: aisles between rows of equal shelf units, fridges, checkouts, fruit, promotional signs, a cold store.
+
+The plan, in metres, with x to the east (0..12) and y to the north (0..10):
+
+    +--f--f--f--f--f--f--f--f--f--f--+------+   f fridges along the north wall
+    |w                               | cold |   w wall shelves, identical along the west wall
+    |w   ||    ||    ||    |         |store |   || rows of shelf units, 0.9 wide; aisles of 1.3
+    |w   ||    ||    ||    ||        +------+   o  checkouts
+    |w   ||    ||    ||    ||              e|   e  shelves along the east wall
+    |w   ==    ==    ==    ==              e|   =  a unit across the end, under a sign of its own
+    |    fruit  bins  pallets    o    o     |
+    +-----window-----window--------door-----+
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fieldkit.frames import Pose, yaw_pose
+from sim_bridge.scenes import forms, prints
+from sim_bridge.scenes import shop_furniture as furniture
+from sim_bridge.scenes import shop_pictures as pictures
+from sim_bridge.scenes.blueprint import Blueprint, Builder
+from sim_bridge.scenes.forms import moved, paint
+from sim_bridge.scenes.halls import EAST, NORTH, SOUTH, WEST, Hall, lamps, outer_walls
+from sim_bridge.scenes.plan import Opening, slab
+from sim_bridge.scenes.shop_furniture import Plan
+from sim_bridge.scenes.shop_pictures import Product
+from sim_bridge.scenes.textures import Rgb, to_bytes
+
+_HALL = Hall(12.0, 10.0, 3.4)
+_BANDS = [(0.0, 0.25, (120, 124, 120)), (2.35, 2.5, (76, 128, 96)), (2.56, 2.6, (76, 128, 96))]
+_ROWS_X = (2.25, 4.55, 6.85, 9.15)
+_ROW_START_M = 3.85
+_WINDOWS = (Opening(1.6, 1.8, 2.5, 0.9), Opening(4.6, 1.8, 2.5, 0.9))
+
+
+def shop(seed: int) -> Blueprint:
+    """Make the shop of 12 x 10 m, 3.4 m high; the same seed gives the same shop."""
+    rng = np.random.default_rng([seed, 41801])
+    build = Builder()
+    _shell(build, rng)
+    articles = furniture.catalogue(rng, 22)
+    low = [furniture.plan(rng, articles, boards=4, tallest_m=0.3) for _ in range(4)]
+    high = [furniture.plan(rng, articles, boards=5, tallest_m=0.3) for _ in range(2)]
+    _aisles(build, rng, articles, low)
+    _walls(build, rng, articles, high)
+    _fridges(build, rng, articles)
+    _front(build, rng, articles)
+    _signs(build, rng)
+    return build.blueprint(floor_bounds=_HALL.bounds)
+
+
+def _shell(build: Builder, rng: np.random.Generator) -> None:
+    size = (_HALL.length_m, _HALL.width_m)
+    floor = prints.tiled(rng, size, tile_m=0.4, base=(176, 172, 164), joint=(156, 152, 146))
+    slab(build, _HALL.bounds, z_m=0.0, texture=build.texture(floor), up=True, cell_m=0.14)
+    above = prints.ceiling_grid((0.6, 0.6), base=(214, 214, 212), step_m=0.6)
+    slab(build, _HALL.bounds, z_m=_HALL.height_m, texture=build.texture(above), up=False, cell_m=0.6, tile_m=(0.6, 0.6))
+    faces = []
+    for side in range(4):
+        face = (_HALL.side_m(side), _HALL.height_m)
+        tone = np.array([206, 204, 196]) + rng.normal(0, 3, 3)
+        faces.append(build.texture(prints.banded(prints.blank(rng, face, base=tone), face, _BANDS)))
+    outer_walls(
+        build, _HALL, faces, windows={SOUTH: _WINDOWS}, trim=None, power=1.1, view=build.texture(_street(rng)),
+        cell_m=0.2,
+    )  # fmt: skip
+    spots = [(x, y) for x in (1.1, 3.4, 5.7, 8.0, 10.6) for y in (1.6, 5.0, 8.4)]
+    lamps(build, spots, z_m=3.1, size_m=(0.16, 1.6), power=1.9, housing=paint(build, (150, 150, 152)))
+
+
+def _street(rng: np.random.Generator) -> Rgb:
+    """Draw the bright street that is seen through the windows: hardly anything."""
+    fade = np.linspace(255, 226, 64)[:, None, None]
+    return to_bytes(np.broadcast_to(fade, (64, 64, 3)) + rng.normal(0, 0.5, (64, 64, 1)))
+
+
+def _aisles(build: Builder, rng: np.random.Generator, articles: list[Product], plans: list[Plan]) -> None:
+    """Add the rows of units: the same run of plans stands in several aisles."""
+    first = [plans[0], plans[0], plans[1], plans[1]]
+    second = [plans[2], plans[3], plans[2], plans[3]]
+    for i, x in enumerate(_ROWS_X):
+        count = 4 if i < 3 else 2
+        sides = (first, second) if i != 1 else (second, first)
+        middle = _ROW_START_M + count / 2
+        at = yaw_pose([x, middle, 0.0], np.pi / 2)
+        furniture.gondola(build, rng, at, articles, (sides[0][:count], sides[1][:count]), height_m=1.5)
+        end = yaw_pose([x, _ROW_START_M - 0.035, 0.0], np.pi)
+        content = furniture.plan(rng, articles, boards=4, tallest_m=0.3)
+        furniture.endcap(build, rng, end, articles, content, height_m=1.4)
+
+
+def _walls(build: Builder, rng: np.random.Generator, articles: list[Product], plans: list[Plan]) -> None:
+    """Add the wall shelves: one plan all along the west wall but for two units, another along the east wall."""
+    for i in range(6):
+        at = _HALL.on(WEST, 1.6 + i)
+        furniture.shelf_unit(build, rng, at, articles, plans[0] if i != 3 else plans[1], height_m=2.0)
+    for i in range(3):
+        at = _HALL.on(EAST, 4.2 + i)
+        furniture.shelf_unit(build, rng, at, articles, plans[1], height_m=2.0)
+
+
+def _fridges(build: Builder, rng: np.random.Generator, articles: list[Product]) -> None:
+    cold = articles[::3]
+    doors = [build.texture(pictures.fridge_door(rng, (0.75, 1.64), cold)) for _ in range(2)]
+    for i in range(3):
+        at = _HALL.on(NORTH, _HALL.length_m - 2.0 - 2.3 * i)
+        furniture.fridge(build, at, [doors[0], doors[1], doors[0]])
+    white = build.texture(pictures.cold_panel((2.1, 2.6)))
+    store = yaw_pose([_HALL.length_m - 1.06, _HALL.width_m - 1.21, 0.0], 0.0)
+    with build.thing("cold store", store, kind="fixed"):
+        forms.shell(build, store, [0.0, 0.0, 1.3], [2.1, 2.4, 2.6], {"-x": white, "-y": white, "+z": white}, cell_m=0.2)
+        grey = paint(build, (176, 180, 182))
+        build.box(store, [-0.2, -1.215, 1.0], [1.0, 0.03, 2.0], grey, cell_m=0.2)
+        build.box(store, [0.2, -1.26, 1.05], [0.04, 0.06, 0.3], paint(build, (60, 62, 66)))
+        build.block(store, (2.1, 2.44))
+    sign = prints.sheet((120, 170), (40, 90, 160))
+    prints.lettering(sign, prints.word(rng), (8, 8, 162, 60), ink=(240, 240, 240))
+    prints.lines(rng, sign, (10, 62, 160, 116), line_px=12, ink=(240, 240, 240))
+    forms.hang(build, moved(store, -1.05, -0.2, yaw_rad=np.pi / 2), (0.5, 0.35), sign, up_m=1.7, name="sign")
+
+
+def _front(build: Builder, rng: np.random.Generator, articles: list[Product]) -> None:
+    """Add checkouts, fruit, bins, pallets and signs in front of the aisles."""
+    for x in (8.15, 9.95):
+        furniture.checkout(build, rng, yaw_pose([x, 1.55, 0.0], np.pi / 2))
+    furniture.fruit_stand(build, rng, _HALL.on(SOUTH, 3.1), columns=4)
+    furniture.bin_of_goods(build, rng, yaw_pose([2.3, 2.35, 0.0], 0.1), articles)
+    furniture.bin_of_goods(build, rng, yaw_pose([4.55, 2.35, 0.0], 0.0), articles)
+    picked = [articles[int(i)] for i in rng.permutation(len(articles))[:2]]
+    furniture.pallet_of_goods(build, yaw_pose([6.5, 2.2, 0.0], 0.0), picked[0], layers=4)
+    furniture.pallet_of_goods(build, yaw_pose([6.5, 1.1, 0.0], 0.05), picked[1], layers=3)
+    furniture.baskets(build, yaw_pose([11.7, 0.6, 0.0], 0.0), count=9)
+    furniture.baskets(build, yaw_pose([11.7, 1.2, 0.0], 0.0), count=6)
+    for i in range(3):
+        furniture.trolley(build, yaw_pose([11.6, 2.1 + 0.36 * i, 0.0], np.pi / 2))
+    furniture.stand(build, rng, yaw_pose([0.6, 0.9, 0.0], -0.6))
+    furniture.stand(build, rng, yaw_pose([10.95, 7.0, 0.0], 0.4))
+
+
+def _signs(build: Builder, rng: np.random.Generator) -> None:
+    """Hang signs over the aisles, promotions in a few places, a notice board and posters."""
+    for i, x in enumerate((1.15, 3.4, 5.7, 8.0, 10.4)):
+        size = (1.0, 0.34)
+        texture = build.texture(pictures.category(rng, size, i + 1))
+        at = yaw_pose([x, 4.0, 0.0], np.pi)
+        with build.thing("aisle sign", moved(at, z_m=2.45), kind="picture"):
+            for yaw in (0.0, np.pi):
+                build.panel(forms.upright(moved(at, yaw_rad=yaw), 0.0, 0.008, 2.45), size, texture, solid=False)
+            build.box(at, [0.0, 0.0, 2.45], [1.02, 0.012, 0.36], paint(build, (40, 60, 50)), solid=False)
+    dark = paint(build, (52, 52, 56))
+    for place, size, up in _poster_places(rng):
+        forms.hang(build, place, size, pictures.promotion(rng, size), up_m=up, frame=dark, name="promotion")
+    board = (1.3, 0.9)
+    forms.hang(build, _HALL.on(SOUTH, 6.55), board, pictures.notices(rng, board), up_m=1.5, name="notice board")
+
+
+def _poster_places(rng: np.random.Generator) -> list[tuple[Pose, tuple[float, float], float]]:
+    """Return wall frames, sizes and heights of the posters: few, in clusters, most of the wall stays blank."""
+    places: list[tuple[Pose, tuple[float, float], float]] = []
+    for side, at in ((WEST, 8.9), (SOUTH, 10.8), (EAST, 3.0), (NORTH, 11.2)):
+        size = (float(rng.uniform(0.6, 0.9)), float(rng.uniform(0.7, 1.1)))
+        up = 1.5 if side != NORTH else 1.9
+        if side != NORTH:
+            places.append((_HALL.on(side, at), size, up))
+    return places
