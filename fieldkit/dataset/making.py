@@ -31,6 +31,7 @@ from fieldkit.store.datasets import (
 )
 from fieldkit.store.files import plain, saving
 
+LOCK_FILE = ".lock"
 # One thread each: as many processes as asked for share the machine, and results do not depend on its processors.
 ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -103,11 +104,11 @@ def make_dataset(
 @contextlib.contextmanager
 def _own(out: Path) -> Iterator[None]:
     """Hold the folder alone: two runs at once would do the same work twice."""
-    if not is_dataset(out):
+    if not is_dataset(out) and not _holds_only_maps(out):
         refuse_existing(out, force=False, kind="folder")
     with saving(out):
         out.mkdir(parents=True, exist_ok=True)
-        stream = (out / ".lock").open("w")
+        stream = (out / LOCK_FILE).open("w")
     with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -117,7 +118,12 @@ def _own(out: Path) -> Iterator[None]:
             yield
         finally:
             with contextlib.suppress(OSError):
-                (out / ".lock").unlink()
+                (out / LOCK_FILE).unlink()
+
+
+def _holds_only_maps(out: Path) -> bool:
+    """Tell whether a folder holds what a run leaves that was killed at once, or maps that were put there."""
+    return out.is_dir() and {p.name for p in out.iterdir()} <= {LOCK_FILE, MAPS_FOLDER, worker.WORK_FOLDER}
 
 
 def _prepare(out: Path, names: list[str], rules: DatasetRules, described: dict[str, Any], *, force: bool) -> None:
@@ -233,7 +239,7 @@ class _Foreman:
             if self._waiting:
                 scene = self._waiting.pop(0)
                 lane.scene, lane.busy = scene, scene.name
-                self._send(lane, worker.Open(scene.source))
+                self._send(lane, worker.Open(scene.name, scene.source))
                 return
             # A second worker pays the opening of a scene: not for a shard or two.
             left = [s for s in self._scenes if len(s.todo) > 2]
@@ -243,7 +249,7 @@ class _Foreman:
         lane.scene = scene
         waypoint = scene.todo.pop(0)
         lane.busy, lane.making = f"{scene.name}/{waypoint}", True
-        self._send(lane, worker.Make(scene.source, waypoint))
+        self._send(lane, worker.Make(scene.name, scene.source, waypoint))
 
     def _send(self, lane: _Lane, request: worker.Open | worker.Make) -> None:
         try:

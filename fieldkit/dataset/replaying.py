@@ -161,7 +161,10 @@ def _replay_scene(scene: _Scene, protocol: Protocol, *, progress: Progress | Non
     priors = [_prior(shard) for shard in shards]
     visits = [Visit(s.waypoint, 0, 0, (), s.next) for s in shards]
     ahead = forward_directions(visits, priors, rules=protocol.candidates)
-    plans, trials, results, truths = [], [], [], []
+    plans: list[VisitPlan] = []
+    trials: list[Trial] = []
+    results: list[ViewResult] = []
+    truths: list[Truth] = []
     for number, (shard, prior, forward) in enumerate(zip(shards, priors, ahead, strict=True)):
         if progress is not None:
             progress(f"replay {scene.session}", number + 1, len(shards))

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import pickle
 import shutil
+import signal
 import tempfile
 import threading
 import traceback
@@ -45,6 +46,7 @@ WORK_FOLDER = ".work"
 class Open:
     """Open a scene: make its map and scene.toml where they are missing; answered by `Opened`."""
 
+    scene: str
     source: bytes
 
 
@@ -60,6 +62,7 @@ class Opened:
 class Make:
     """Make the shard of a waypoint of a scene; answered by `Made`."""
 
+    scene: str
     source: bytes
     waypoint: str
 
@@ -90,6 +93,8 @@ class Failed:
 
 def serve(pipe: connection.Connection, out: Path, rules: DatasetRules) -> None:
     """Answer requests until the pipe is closed; the process ends with the one that started it, however that ended."""
+    # Ctrl-C reaches every process of a terminal; the one that started this one decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
     tempfile.tempdir = str(out / WORK_FOLDER)
@@ -101,11 +106,12 @@ def serve(pipe: connection.Connection, out: Path, rules: DatasetRules) -> None:
             return
         try:
             if desk is None or desk.source_bytes != request.source:
+                # The scene before goes before the next one comes: both would need twice the memory.
                 desk = None
                 desk = Desk(request.source, out, rules, lambda *step: pipe.send(Step(*step)))
             pipe.send(desk.opened() if isinstance(request, Open) else desk.make(request.waypoint))
         except FieldkitError as error:
-            pipe.send(Failed(str(error), ""))
+            pipe.send(Failed(f"{request.scene}: {error}", ""))
         except OSError as error:
             place = f"{os.fsdecode(error.filename)}: " if error.filename else f"{out}: "
             line = f"{place}{error.strerror or error}; the same command goes on from here once that is put right"
