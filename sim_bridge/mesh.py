@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
 
 from fieldkit.frames import Pose
 from sim_bridge.clusters import Clusters, clusters
@@ -24,6 +25,21 @@ MIN_TEXTURE_PX = 1024
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Clearance:
+    """Distances f32[nx,ny] in m to the nearest obstacle at the middles of square cells; ``corner_xy`` is the grid's."""
+
+    distance_m: NDArray[np.float32]
+    corner_xy: tuple[float, float]
+    cell_m: float
+
+    def at(self, points: Array) -> Array:
+        """Return the distances f64[n] at points (n, 2), linear between the cells; 0 outside of the grid."""
+        index = (points - np.asarray(self.corner_xy)) / self.cell_m - 0.5
+        found: Array = map_coordinates(self.distance_m, index.T, output=np.float64, order=1, mode="constant")
+        return found
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
     """A textured mesh. Faces are seen from both sides, except those marked ``closed``.
 
@@ -33,7 +49,8 @@ class Scene:
     backs the renderer skips; ``shade`` float32[m,3] baked brightness per face corner (1 leaves the texture as it is).
     ``blocks`` float64[k,8] are the plan-view footprints of what stands on the floor, four corners x, y in turn.
     ``walk_xy`` float64[j,2] is a closed polyline (the last point leads to the first) through free floor for a
-    mapping walk. ``floor_bounds`` (x0, y0, x1, y1) is the floor's rectangle.
+    mapping walk. ``floor_bounds`` (x0, y0, x1, y1) is the floor's rectangle. ``clearance`` says, beside ``blocks``,
+    how far off the next obstacle is, where that was measured on the mesh.
     """
 
     vertices: Array
@@ -47,6 +64,7 @@ class Scene:
     walk_xy: Array
     floor_bounds: tuple[float, float, float, float]
     background: tuple[int, int, int] = (128, 128, 128)
+    clearance: Clearance | None = None
 
     @functools.cached_property
     def bounds(self) -> Array:
@@ -95,23 +113,39 @@ class Scene:
         Directions need not have unit length; the distance is metric. The face is found by Embree (single precision)
         and the distance computed from its plane in double precision.
         """
-        start = np.atleast_2d(np.asarray(origins, dtype=np.float64))
-        ray = np.atleast_2d(np.asarray(directions, dtype=np.float64))
-        start, ray = np.broadcast_arrays(start, ray)
-        unit = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        return self._first_hits(*_rays(origins, directions))[0]
+
+    def trace(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
+        """Return the distances of `intersect` and the surfaces' unit normals f64[n,3] that face the rays' origins.
+
+        Normals are zero where there is no surface.
+        """
+        start, unit = _rays(origins, directions)
+        distance, normal = self._first_hits(start, unit)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        towards = np.where((normal * unit).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)
+        return distance, towards * normal / np.where(length > 0, length, 1.0)
+
+    def _first_hits(self, start: Array, unit: Array) -> tuple[Array, Array]:
+        """Return the distances of rays to the first surface, and normals of any length and sign."""
         origin = self._origin
         first = len(origin.faces) if origin is not None else 0
-        nearest = np.full(len(start), np.inf) if origin is None else origin.intersect(start, unit)
+        if origin is not None:
+            nearest, normals = origin._first_hits(start, unit)
+        else:
+            nearest, normals = np.full(len(start), np.inf), np.zeros((len(start), 3))
         if first == len(self.faces):
-            return nearest
+            return nearest, normals
         face = self._rays.intersects_first(start, unit)
-        hit = face >= 0
+        hit = np.flatnonzero(face >= 0)
         a, b, c = (self.vertices[self.faces[first + face[hit], i]] for i in range(3))
         normal = np.cross(b - a, c - a)
-        distance = np.full(len(start), np.inf)
-        distance[hit] = ((a - start[hit]) * normal).sum(axis=1) / (unit[hit] * normal).sum(axis=1)
-        first_hit: Array = np.fmin(distance, nearest)
-        return first_hit
+        distance = ((a - start[hit]) * normal).sum(axis=1) / (unit[hit] * normal).sum(axis=1)
+        # A ray that grazes a face may come out with no distance.
+        nearer = distance < nearest[hit]
+        nearest[hit] = np.fmin(distance, nearest[hit])
+        normals[hit[nearer]] = normal[nearer]
+        return nearest, normals
 
     def free_floor(self, xy: ArrayLike, radius_m: float) -> NDArray[np.bool_]:
         """Return bool[n]: whether a disc of this radius around points (n, 2) touches neither furniture nor walls."""
@@ -119,8 +153,18 @@ class Scene:
         x0, y0, x1, y1 = self.floor_bounds
         low, high = np.array([x0, y0]) + radius_m, np.array([x1, y1]) - radius_m
         free: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
-        for block in self.blocks:
-            free &= _distance_to_block(points, block.reshape(4, 2)) >= radius_m
+        if self.clearance is not None:
+            free &= self.clearance.at(points) >= radius_m
+        near = np.flatnonzero(free)
+        if not len(near) or not len(self.blocks):
+            return free
+        # Most blocks are far away from most points: only pairs that are near by their bounds are looked at closely.
+        corners = self.blocks.reshape(-1, 4, 2)
+        for some in np.array_split(near, len(near) * len(corners) // 2_000_000 + 1):
+            below = (points[some, None] >= corners.min(axis=1) - radius_m).all(axis=2)
+            point, block = np.nonzero(below & (points[some, None] <= corners.max(axis=1) + radius_m).all(axis=2))
+            touched = _distance_to_blocks(points[some[point]], corners[block]) < radius_m
+            free[some[point[touched]]] = False
         return free
 
     def with_quad(self, world_from_quad: Pose, width_m: float, height_m: float, texture: Rgb) -> Scene:
@@ -196,12 +240,19 @@ def _enlarged(texture: Rgb) -> Rgb:
     return np.ascontiguousarray(np.repeat(np.repeat(image, factor, axis=0), factor, axis=1))
 
 
-def _distance_to_block(points: Array, corners: Array) -> Array:
-    """Return the distance f64[n] of points (n, 2) to a convex polygon (k, 2); 0 inside."""
-    edges = np.roll(corners, -1, axis=0) - corners
-    delta = points[:, None] - corners[None]
-    along = np.clip((delta * edges).sum(axis=2) / (edges**2).sum(axis=1), 0.0, 1.0)
+def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
+    start = np.atleast_2d(np.asarray(origins, dtype=np.float64))
+    ray = np.atleast_2d(np.asarray(directions, dtype=np.float64))
+    start, ray = np.broadcast_arrays(start, ray)
+    return start, ray / np.linalg.norm(ray, axis=1, keepdims=True)
+
+
+def _distance_to_blocks(points: Array, corners: Array) -> Array:
+    """Return the distance f64[n] of points (n, 2) to convex polygons (n, k, 2), one each; 0 inside."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    delta = points[:, None] - corners
+    along = np.clip((delta * edges).sum(axis=2) / (edges**2).sum(axis=2), 0.0, 1.0)
     distance = np.linalg.norm(delta - along[..., None] * edges, axis=2).min(axis=1)
-    side = edges[:, 0] * delta[..., 1] - edges[:, 1] * delta[..., 0]
+    side = edges[..., 0] * delta[..., 1] - edges[..., 1] * delta[..., 0]
     inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
     return np.where(inside, 0.0, distance)
