@@ -145,7 +145,7 @@ class _ProgressLines:
             return
         self._last = at.seconds
         left = "" if at.seconds_left is None else f", {at.seconds_left / 60:.1f} min left"
-        speed = f"{at.images / at.seconds:.1f} views/s" if at.images else "preparing"
+        speed = "preparing" if at.images_s is None else f"{at.images_s:.1f} views/s"
         where = ", ".join(at.what)
         logging.getLogger(__name__).info("%d of %d waypoints, %s%s | %s", at.done, at.total, speed, left, where)
 

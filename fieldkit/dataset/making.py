@@ -38,12 +38,15 @@ ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NU
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a dataset is: what each worker does, shards done and in all, images localized and seconds in this run."""
+    """How far a dataset is: what each worker does, shards done and in all, and seconds since the start.
+
+    ``images_s`` are the images localized per second since the first map was there.
+    """
 
     what: tuple[str, ...]
     done: int
     total: int
-    images: int
+    images_s: float | None
     seconds: float
     seconds_left: float | None
 
@@ -217,6 +220,7 @@ class _Foreman:
         self._waiting = list(scenes)
         self._begin = time.monotonic()
         self._images = self._made = 0
+        self._first_shard: float | None = None
 
     def run(self) -> None:
         """Work until every shard of every scene is there."""
@@ -290,13 +294,15 @@ class _Foreman:
         if self._progress is None:
             return
         now = time.monotonic()
+        if self._first_shard is None and any(lane.making for lane in self._lanes):
+            self._first_shard = now
         opened = [s for s in self._scenes if s.opened]
         left = sum(len(s.todo) for s in opened) + sum(lane.making for lane in self._lanes)
         total = sum(s.total for s in opened)
         # Scenes that are not open yet are taken to be as large as the others.
-        closed = len(self._scenes) - len(opened)
-        each = total / len(opened) if opened else 0.0
-        seconds = now - self._begin
-        remaining = None if not self._made else (left + closed * each) * seconds / self._made
+        closed = (len(self._scenes) - len(opened)) * (total / len(opened) if opened else 0.0)
+        at_work = 0.0 if self._first_shard is None else now - self._first_shard
+        speed = self._images / at_work if self._images and at_work > 0.0 else None
+        remaining = (left + closed) * at_work / self._made if self._made else None
         what = tuple(lane.busy for lane in self._lanes if lane.busy)
-        self._progress(Progress(what, total - left, round(total + closed * each), self._images, seconds, remaining))
+        self._progress(Progress(what, total - left, round(total + closed), speed, now - self._begin, remaining))
