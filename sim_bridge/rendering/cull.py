@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.rendering.kernels import kernel
+from sim_bridge.rendering.kernels import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -121,7 +121,7 @@ def bin_tiles(bounds: Ints, across: int, down: int) -> tuple[Longs, Ints]:
     return starts, members
 
 
-@kernel
+@inlined
 def _bounds(p: Floats) -> tuple[float, float, float, float]:
     """Return the pixel bounds (x0, y0, x1, y1) of the part of a triangle f64[3,3] beyond the near plane."""
     x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
@@ -139,7 +139,7 @@ def _bounds(p: Floats) -> tuple[float, float, float, float]:
     return max(x0, -_FAR_OUT), max(y0, -_FAR_OUT), min(x1, _FAR_OUT), min(y1, _FAR_OUT)
 
 
-@kernel
+@inlined
 def _covers_none(low: float, high: float, size: float) -> bool:
     """Return whether no sample's column (or row) of 0..size lies between two pixel positions."""
     if high < 0.0 or low >= size:
@@ -147,7 +147,7 @@ def _covers_none(low: float, high: float, size: float) -> bool:
     return high - low < 1.0 and math.ceil(low * _GRID - _GRID_SLACK) > math.floor(high * _GRID + _GRID_SLACK)
 
 
-@kernel
+@inner
 def set_up(mesh: Mesh, cluster: int, view: View, out: Set, first: int, p: Floats) -> int:
     """Set up the triangles of a cluster that may touch the image, from place ``first`` of ``out``.
 
@@ -191,7 +191,7 @@ def set_up(mesh: Mesh, cluster: int, view: View, out: Set, first: int, p: Floats
     return k
 
 
-@kernel
+@inlined
 def _cross(p: Floats, s: int, t: int) -> tuple[float, float, float]:
     return (
         p[s, 1] * p[t, 2] - p[s, 2] * p[t, 1],

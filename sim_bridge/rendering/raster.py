@@ -13,7 +13,8 @@ from numba import prange
 from numpy.typing import NDArray
 
 from sim_bridge.rendering.cull import TILE_H, TILE_W, Mesh, Set, View, set_up
-from sim_bridge.rendering.kernels import kernel, parallel_kernel
+from sim_bridge.rendering.fragments import CHUNK
+from sim_bridge.rendering.kernels import inlined, inner, kernel, parallel_kernel
 from sim_bridge.rendering.shade import DX, DY, Picture, Textures, resolve
 
 Floats = NDArray[np.float64]
@@ -21,8 +22,6 @@ Ints = NDArray[np.int32]
 Longs = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-# A tile's samples lie in memory by row, then by chunk of 8 pixels, then by sample, then by pixel of the chunk.
-CHUNK = 8
 # After so many pixels are drawn into a tile, its farthest depth is looked up again.
 _REFRESH_PX = 256
 
@@ -37,13 +36,15 @@ class Bins(NamedTuple):
 
 
 class Tile(NamedTuple):
-    """The visibility buffer of a tile: the largest 1/z so far, who has it (-1 nobody), and offsets of its samples."""
+    """The visibility buffer of a tile: the largest 1/z so far, who has it (-1 nobody), offsets of its
+    samples, and scratch."""
 
     w: Floats
     owner: Ints
     x: Floats
     y: Floats
     farthest: Floats
+    corners: Floats
 
 
 @kernel
@@ -56,10 +57,10 @@ def _new_tile(samples: int) -> Tile:
         s = (i % chunk) // CHUNK + 5 - samples
         x[i] = (i // chunk) * CHUNK + i % CHUNK + 0.5 + DX[s]
         y[i] = 0.5 + DY[s]
-    return Tile(np.empty(row * TILE_H), np.empty(row * TILE_H, np.int32), x, y, np.empty(chunk))
+    return Tile(np.empty(row * TILE_H), np.empty(row * TILE_H, np.int32), x, y, np.empty(chunk), np.empty((3, 3)))
 
 
-@kernel
+@inner
 def _farthest(tile: Tile) -> float:
     """Return the smallest 1/z of a tile: what lies behind it is hidden."""
     least = tile.farthest
@@ -69,10 +70,13 @@ def _farthest(tile: Tile) -> float:
         here = tile.w[first : first + count]
         for i in range(count):
             least[i] = here[i] if here[i] < least[i] else least[i]
-    return float(least.min())
+    result = float(least[0])
+    for i in range(1, count):
+        result = min(result, least[i])
+    return result
 
 
-@kernel
+@inlined
 def _span(plane: Floats, i: int, x0: float, y0: float) -> tuple[float, float, float, float]:
     """Return where edge i lets a triangle begin and end in the row at y of a tile: from slope * y + start on, and up
     to slope * y + end, with half a pixel to spare; an edge along the rows limits nothing."""
@@ -87,7 +91,7 @@ def _span(plane: Floats, i: int, x0: float, y0: float) -> tuple[float, float, fl
     return 0.0, -np.inf, slope, at + margin
 
 
-@kernel
+@inlined
 def _cover(plane: Floats, k: int, box: Ints, tx: int, ty: int, tile: Tile) -> int:
     """Enter one triangle into a tile; return about how many pixels it may cover there."""
     row_size = tile.x.shape[0]
@@ -127,7 +131,7 @@ def _cover(plane: Floats, k: int, box: Ints, tx: int, ty: int, tile: Tile) -> in
     return touched * (CHUNK // 2)
 
 
-@kernel
+@inner
 def _fill(
     number: int, area: tuple[int, int], mesh: Mesh, view: View, bins: Bins, out: Set, places: Longs, tile: Tile
 ) -> None:
@@ -137,7 +141,6 @@ def _fill(
     tile.w[:] = 0.0
     tile.owner[:] = -1
     farthest, drawn = 0.0, 0
-    corners = np.empty((3, 3))
     used = places.shape[0] - 1
     for at in range(bins.starts[number], bins.starts[number + 1]):
         c = bins.members[at]
@@ -145,7 +148,7 @@ def _fill(
             break
         if places[c, 0] < 0:
             places[c, 0] = places[used, 0]
-            places[used, 0] = places[c, 1] = set_up(mesh, bins.cluster[c], view, out, places[used, 0], corners)
+            places[used, 0] = places[c, 1] = set_up(mesh, bins.cluster[c], view, out, places[used, 0], tile.corners)
         for k in range(places[c, 0], places[c, 1]):
             box = out.boxes[k]
             if box[0] >= tx + TILE_W or box[2] < tx or box[1] >= ty + TILE_H or box[3] < ty or out.near[k] <= farthest:
@@ -177,7 +180,7 @@ def _band(
     for number in range(first, stop):
         area = ((number % across) * TILE_W, (number // across) * TILE_H)
         _fill(number, area, mesh, view, bins, out, places, tile)
-        resolve(area, mesh, textures, out, tile.w, tile.owner, samples, room, picture)
+        resolve(area[0], area[1], mesh, textures, out, tile.w, tile.owner, samples, room, picture)
 
 
 @parallel_kernel

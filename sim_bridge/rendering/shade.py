@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.rendering.cull import TILE_H, TILE_W, Mesh, Set
-from sim_bridge.rendering.kernels import kernel
+from sim_bridge.rendering.fragments import CHUNK, Tile, list_fragments, place
+from sim_bridge.rendering.kernels import inlined, inner
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -18,7 +19,6 @@ Ints = NDArray[np.int32]
 Longs = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint32]
-Colour = tuple[float, float, float]
 
 MAX_TAPS = 8
 # A level of detail half a level finer than the footprint asks for: 2 ** -0.5.
@@ -30,10 +30,11 @@ _TAP_ROUNDING = 0.75
 DX = (-0.125, 0.375, 0.125, -0.375, 0.0)
 DY = (-0.375, -0.125, 0.375, 0.125, 0.0)
 
-_CHUNK = 8
 # Positions in a texture are whole numbers of 2 ** -16 texels; weights use the upper 8 bits of the fraction.
 _ONE, _HALF = 65536.0, 32768.0
-_ROUND = 0.5 + 1e-9
+# Colours of the image are added up in 2 ** -32 levels; a half is rounded up whatever a sum's last bits are.
+_BITS = 32
+_UNIT, _ROUND = 2.0**_BITS, 2 ** (_BITS - 1) + 2 ** (_BITS - 10)
 # Red, blue and green of a texel, spread to 21 bits each; weights of one filter add up to at most 2 ** 13.
 _SPREAD = 0x3FC001FE000FF
 _LANE = (1 << 21) - 1
@@ -71,7 +72,7 @@ class Filter(NamedTuple):
     step_v: float
 
 
-@kernel
+@inlined
 def _footprint(ux: float, vx: float, uy: float, vy: float) -> tuple[float, float, float, float]:
     """Return the axes of a pixel in texels: long and short length, and the unit direction of the long one.
 
@@ -91,12 +92,12 @@ def _footprint(ux: float, vx: float, uy: float, vy: float) -> tuple[float, float
     return long, short, 1.0, 0.0
 
 
-@kernel
-def _filter(levels: Longs, texture: int, ux: float, vx: float, uy: float, vy: float) -> Filter:
-    """Choose the filter of a texture from the derivatives of its coordinates: trilinear, with
+@inlined
+def _filter(levels: Longs, texture: int, j: tuple[float, float, float, float]) -> Filter:
+    """Choose the filter of a texture from j = du/dx, dv/dx, du/dy, dv/dy: trilinear, with
     up to MAX_TAPS taps along the longer axis of the footprint."""
     width, height = levels[texture, 0, 1], levels[texture, 0, 2]
-    long, short, dx, dy = _footprint(ux * width, vx * height, uy * width, vy * height)
+    long, short, dx, dy = _footprint(j[0] * width, j[1] * height, j[2] * width, j[3] * height)
     taps = MAX_TAPS if long > MAX_TAPS * short else max(1, int(long / short + _TAP_ROUNDING))
     level, size = 0, LOD_FACTOR * long / taps
     while size >= 2.0 and level < levels.shape[1] - 1:
@@ -109,7 +110,7 @@ def _filter(levels: Longs, texture: int, ux: float, vx: float, uy: float, vy: fl
     return Filter(taps, level, whole - far, far, long * dx / (width * taps), long * dy / (height * taps))
 
 
-@kernel
+@inlined
 def _bilinear(texels: Words, start: int, width: int, height: int, x: int, y: int, weight: int) -> int:
     """Return ``weight`` times a mip level at (x, y) in 2 ** -16 texels, clamped at its border: red, green << 21 and
     blue << 42. Whole numbers add up in any order to the same bits."""
@@ -125,14 +126,14 @@ def _bilinear(texels: Words, start: int, width: int, height: int, x: int, y: int
     return int(top + w01 * _spread(texels[np.uint64(at)]) + w11 * _spread(texels[np.uint64(at + 1)]))
 
 
-@kernel
+@inlined
 def _spread(texel: np.uint32) -> np.int64:
     """Give each colour of a texel (red, blue << 10, green << 21) room to be multiplied by 2 ** 13."""
     wide = np.int64(texel)
     return (wide | wide << 32) & _SPREAD
 
 
-@kernel
+@inlined
 def _sample(texels: Words, levels: Longs, texture: int, how: Filter, u: float, v: float) -> int:
     """Filter a texture at (u, v) in 0..1: packed colours times taps * (how.near + how.far)."""
     first = 0.5 * (1 - how.taps)
@@ -151,121 +152,64 @@ def _sample(texels: Words, levels: Longs, texture: int, how: Filter, u: float, v
     return total
 
 
-@kernel
-def _attributes(k: int, f: int, mesh: Mesh, planes: Floats) -> None:
-    """Write u/z, v/z and shade/z of a triangle behind its edges and 1/z: a, b, c of a*x + b*y + c each."""
-    big = 0
-    for j in range(1, 3):
-        if abs(planes[k, 9 + j]) > abs(planes[k, 9 + big]):
-            big = j
-    # The sum of the edges is 1/z times the determinant.
-    scale = planes[k, 9 + big] / (planes[k, big] + planes[k, 3 + big] + planes[k, 6 + big])
-    for j in range(3):
-        e0, e1, e2 = scale * planes[k, j], scale * planes[k, 3 + j], scale * planes[k, 6 + j]
-        planes[k, 12 + j] = e0 * mesh.uv[f, 0, 0] + e1 * mesh.uv[f, 1, 0] + e2 * mesh.uv[f, 2, 0]
-        planes[k, 15 + j] = e0 * mesh.uv[f, 0, 1] + e1 * mesh.uv[f, 1, 1] + e2 * mesh.uv[f, 2, 1]
-        planes[k, 18 + j] = e0 * mesh.shade[f, 0] + e1 * mesh.shade[f, 1] + e2 * mesh.shade[f, 2]
-
-
-@kernel
-def _fragments(owner: Ints, samples: int, rows: int, cols: int, mesh: Mesh, out: Set, into: Ints) -> int:
-    """List what a tile sees: i32[n,5] of triangle, row, column, number of pixels and which samples as bits.
-
-    The fragments of a pixel follow each other; up to 8 pixels that see one triangle wholly are one fragment.
-    """
-    layers = 5 if samples > 1 else 1
-    everything = (1 << samples) - 1
-    n = 0
-    for row in range(rows):
-        run, last = 0, -2
-        for col in range(cols):
-            at = ((row * TILE_W + col) // _CHUNK * layers) * _CHUNK + col % _CHUNK
-            left = everything
-            while left != 0:
-                first = 0
-                while left >> first & 1 == 0:
-                    first += 1
-                k, mask = owner[at + first * _CHUNK], 0
-                for s in range(first, samples):
-                    mask |= (1 if owner[at + s * _CHUNK] == k else 0) << s
-                left &= ~mask
-                if mask == everything and k == last and 0 < run < _CHUNK:
-                    run += 1
-                    into[n - 1, 3] = run
-                    continue
-                run = 1 if mask == everything else 0
-                last = k
-                into[n, 0], into[n, 1], into[n, 2], into[n, 3], into[n, 4] = k, row, col, 1, mask
-                n += 1
-                if k >= 0 and out.texture[k] < 0:
-                    _attributes(k, out.face[k], mesh, out.planes)
-                    out.texture[k] = mesh.texture[out.face[k]]
-    return n
-
-
-@kernel
-def _colour(fragments: Ints, area: tuple[int, int], out: Set, textures: Textures, samples: int, rgb: Bytes) -> None:
+@inner
+def _colour(fragments: Ints, tile: Tile, out: Set, textures: Textures, rgb: Bytes) -> None:
     """Colour the fragments of a tile. One filter serves a fragment, that of its middle.
 
-    Shading at the mean of the samples of one triangle keeps off a texture's outside.
+    Shading at the mean of the samples of one surface keeps off a texture's outside.
     """
-    planes, levels, background = out.planes, textures.levels, textures.background
+    planes, levels, owner, samples = out.planes, textures.levels, tile.owner, tile.samples
     first = 4 if samples == 1 else 0
-    red = green = blue = 0.0
-    done = 0
+    red = green = blue = done = 0
     for n in range(fragments.shape[0]):
-        k, y, x0, length = fragments[n, 0], fragments[n, 1] + area[1], fragments[n, 2] + area[0], fragments[n, 3]
+        k, row, col, length = fragments[n, 0], fragments[n, 1], fragments[n, 2], fragments[n, 3]
         count, dx, dy = 0, 0.0, 0.0
         for s in range(samples):
             if fragments[n, 4] >> s & 1:
                 count, dx, dy = count + 1, dx + DX[first + s], dy + DY[first + s]
-        if k < 0:
-            red, green, blue = red + count * background[0], green + count * background[1], blue + count * background[2]
+        x0, y0 = tile.x + col + 0.5 + dx / count, tile.y + row + 0.5 + dy / count
+        texels, texture, how, unit = textures.texels, 0, Filter(1, 0, 0, 0, 0.0, 0.0), 0.0
+        aw = au = av = cw = cu = cv = 0.0
+        if k >= 0:
+            texture = out.texture[k]
+            aw, au, av = planes[k, 9], planes[k, 12], planes[k, 15]
+            bw, bu, bv = planes[k, 10], planes[k, 13], planes[k, 16]
+            cw, cu, cv = bw * y0 + planes[k, 11], bu * y0 + planes[k, 14], bv * y0 + planes[k, 17]
+            middle = x0 + 0.5 * (length - 1)
+            z = 1.0 / (aw * middle + cw)
+            u, v = (au * middle + cu) * z, (av * middle + cv) * z
+            j = ((au - u * aw) * z, (av - v * aw) * z, (bu - u * bw) * z, (bv - v * bw) * z)
+            how = _filter(levels, texture, j)
+            texels = textures.added if texture >= textures.base else textures.texels
+            unit = _UNIT * count / (samples * how.taps * (how.near + how.far))
+        for i in range(length):
+            if k >= 0:
+                x = x0 + i
+                z = 1.0 / (aw * x + cw)
+                packed = _sample(texels, levels, texture, how, (au * x + cu) * z, (av * x + cv) * z)
+                # The light is that of the pixel's own triangle, not of the one that stands for it.
+                m = k if length == 1 else owner[place(row, col + i, tile.layers)]
+                bright = planes[m, 18] * x + planes[m, 19] * y0 + planes[m, 20]
+                light = int(unit * (bright * z))
+                red, green = red + light * (packed & _LANE), green + light * (packed >> 21 & _LANE)
+                blue += light * (packed >> 42)
+            else:
+                part = _UNIT * count / samples
+                red += int(part * textures.background[0])
+                green += int(part * textures.background[1])
+                blue += int(part * textures.background[2])
             done += count
             if done == samples:
-                for x in range(x0, x0 + length):
-                    _write(rgb, y, x, red / samples, green / samples, blue / samples)
-                red = green = blue = 0.0
-                done = 0
-            continue
-        v0 = y + 0.5 + dy / count
-        aw, au, av, al = planes[k, 9], planes[k, 12], planes[k, 15], planes[k, 18]
-        bw, bu, bv = planes[k, 10], planes[k, 13], planes[k, 16]
-        cw, cu, cv = bw * v0 + planes[k, 11], bu * v0 + planes[k, 14], bv * v0 + planes[k, 17]
-        cl = planes[k, 19] * v0 + planes[k, 20]
-        shift = dx / count
-        middle = x0 + 0.5 * length + shift
-        z = 1.0 / (aw * middle + cw)
-        u, v = (au * middle + cu) * z, (av * middle + cv) * z
-        texture = out.texture[k]
-        how = _filter(levels, texture, (au - u * aw) * z, (av - v * aw) * z, (bu - u * bw) * z, (bv - v * bw) * z)
-        texels = textures.added if texture >= textures.base else textures.texels
-        share = count / (how.taps * (how.near + how.far))
-        for x in range(x0, x0 + length):
-            q = x + 0.5 + shift
-            z = 1.0 / (aw * q + cw)
-            packed = _sample(texels, levels, texture, how, (au * q + cu) * z, (av * q + cv) * z)
-            light = (al * q + cl) * z * share
-            red, green = red + light * (packed & _LANE), green + light * (packed >> 21 & _LANE)
-            blue += light * (packed >> 42)
-            done += count
-            if done == samples:
-                _write(rgb, y, x, red / samples, green / samples, blue / samples)
-                red = green = blue = 0.0
-                done = 0
+                rgb[tile.y + row, tile.x + col + i, 0] = np.uint8(min(255, red + _ROUND >> _BITS))
+                rgb[tile.y + row, tile.x + col + i, 1] = np.uint8(min(255, green + _ROUND >> _BITS))
+                rgb[tile.y + row, tile.x + col + i, 2] = np.uint8(min(255, blue + _ROUND >> _BITS))
+                red = green = blue = done = 0
 
 
-@kernel
-def _write(rgb: Bytes, y: int, x: int, red: float, green: float, blue: float) -> None:
-    """Round a colour; a half goes up, whatever a sum's last bits are."""
-    rgb[y, x, 0] = np.uint8(min(255.0, red + _ROUND))
-    rgb[y, x, 1] = np.uint8(min(255.0, green + _ROUND))
-    rgb[y, x, 2] = np.uint8(min(255.0, blue + _ROUND))
-
-
-@kernel
+@inner
 def resolve(
-    area: tuple[int, int],
+    x: int,
+    y: int,
     mesh: Mesh,
     textures: Textures,
     out: Set,
@@ -275,15 +219,14 @@ def resolve(
     room: Ints,
     picture: Picture,
 ) -> None:
-    """Turn the visibility buffer of a tile (see `raster`) into colour and depth; room i32[4*pixels,5] is scratch."""
+    """Turn the visibility buffer of the tile at pixel (x, y) into colour and depth; room i32[4*pixels,5] is scratch."""
     height, width = picture.depth.shape
     layers = 5 if samples > 1 else 1
-    rows, cols = min(TILE_H, height - area[1]), min(TILE_W, width - area[0])
-    for row in range(rows):
-        y = area[1] + row
-        for col in range(cols):
-            at = ((row * TILE_W + col) // _CHUNK * layers + layers - 1) * _CHUNK + col % _CHUNK
-            picture.depth[y, area[0] + col] = 1.0 / w[at] if w[at] > 0.0 else 0.0
-            picture.seen[y, area[0] + col] = owner[at]
-    n = _fragments(owner, samples, rows, cols, mesh, out, room)
-    _colour(room[:n], area, out, textures, samples, picture.rgb)
+    tile = Tile(owner, samples, layers, x, y, min(TILE_H, height - y), min(TILE_W, width - x))
+    for row in range(tile.rows):
+        for col in range(tile.cols):
+            at = place(row, col, layers) + (layers - 1) * CHUNK
+            picture.depth[y + row, x + col] = 1.0 / w[at] if w[at] > 0.0 else 0.0
+            picture.seen[y + row, x + col] = owner[at]
+    n = list_fragments(tile, mesh, textures.levels, out, room)
+    _colour(room[:n], tile, out, textures, picture.rgb)
