@@ -123,20 +123,22 @@ def _fridges(build: Builder, rng: np.random.Generator, articles: list[Product]) 
 
 def _front(build: Builder, rng: np.random.Generator, articles: list[Product]) -> None:
     """Add checkouts, fruit, bins, pallets and signs in front of the aisles."""
-    for x in (8.15, 9.95):
-        furniture.checkout(build, rng, yaw_pose([x, 1.55, 0.0], np.pi / 2))
+    for x in (8.25, 9.95):
+        furniture.checkout(build, rng, yaw_pose([x, 1.02, 0.0], np.pi / 2))
     furniture.fruit_stand(build, rng, _HALL.on(SOUTH, 3.1), columns=4)
-    furniture.bin_of_goods(build, rng, yaw_pose([2.3, 2.35, 0.0], 0.1), articles)
-    furniture.bin_of_goods(build, rng, yaw_pose([4.55, 2.35, 0.0], 0.0), articles)
-    picked = [articles[int(i)] for i in rng.permutation(len(articles))[:2]]
-    furniture.pallet_of_goods(build, yaw_pose([6.5, 2.2, 0.0], 0.0), picked[0], layers=4)
-    furniture.pallet_of_goods(build, yaw_pose([6.5, 1.1, 0.0], 0.05), picked[1], layers=3)
-    furniture.baskets(build, yaw_pose([11.7, 0.6, 0.0], 0.0), count=9)
-    furniture.baskets(build, yaw_pose([11.7, 1.2, 0.0], 0.0), count=6)
+    for x in _ROWS_X[:2]:
+        furniture.bin_of_goods(build, rng, yaw_pose([x, 3.03, 0.0], rng.normal(0, 0.03)), articles)
+    picked = [articles[int(i)] for i in rng.permutation(len(articles))[:3]]
+    furniture.pallet_of_goods(build, yaw_pose([_ROWS_X[2], 3.02, 0.0], rng.normal(0, 0.03)), picked[0], layers=4)
+    furniture.pallet_of_goods(build, yaw_pose([6.35, 0.38, 0.0], rng.normal(0, 0.03)), picked[2], layers=3)
+    furniture.pallet_of_goods(build, yaw_pose([11.55, 7.15, 0.0], rng.normal(0, 0.03)), picked[1], layers=5)
+    furniture.pallet_of_goods(build, yaw_pose([0.44, 9.62, 0.0], 0.0), picked[0], layers=6)
+    furniture.baskets(build, yaw_pose([11.7, 1.35, 0.0], np.pi / 2), count=9)
+    furniture.baskets(build, yaw_pose([11.7, 1.9, 0.0], np.pi / 2), count=6)
+    furniture.stand(build, rng, yaw_pose([11.6, 0.4, 0.0], 0.9))
     for i in range(3):
-        furniture.trolley(build, yaw_pose([11.6, 2.1 + 0.36 * i, 0.0], np.pi / 2))
-    furniture.stand(build, rng, yaw_pose([0.6, 0.9, 0.0], -0.6))
-    furniture.stand(build, rng, yaw_pose([10.95, 7.0, 0.0], 0.4))
+        furniture.trolley(build, yaw_pose([0.52, 0.34 + 0.56 * i, 0.0], -np.pi / 2))
+    furniture.stand(build, rng, yaw_pose([10.5, 7.22, 0.0], 0.05))
 
 
 def _signs(build: Builder, rng: np.random.Generator) -> None:
@@ -159,9 +161,7 @@ def _signs(build: Builder, rng: np.random.Generator) -> None:
 def _poster_places(rng: np.random.Generator) -> list[tuple[Pose, tuple[float, float], float]]:
     """Return wall frames, sizes and heights of the posters: few, in clusters, most of the wall stays blank."""
     places: list[tuple[Pose, tuple[float, float], float]] = []
-    for side, at in ((WEST, 8.9), (SOUTH, 10.8), (EAST, 3.0), (NORTH, 11.2)):
+    for side, at in ((WEST, 8.6), (SOUTH, 8.85), (SOUTH, 11.0), (EAST, 2.7)):
         size = (float(rng.uniform(0.6, 0.9)), float(rng.uniform(0.7, 1.1)))
-        up = 1.5 if side != NORTH else 1.9
-        if side != NORTH:
-            places.append((_HALL.on(side, at), size, up))
+        places.append((_HALL.on(side, at), size, 1.55))
     return places

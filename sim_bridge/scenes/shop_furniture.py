@@ -147,7 +147,7 @@ def endcap(
     """Add a unit across the end of a gondola, under a promotional sign of its own."""
     shelf_unit(build, rng, place, articles, content, height_m=height_m, sold_out=0.0)
     size = (0.9, float(rng.uniform(0.32, 0.5)))
-    board = paint(build, (60, 60, 64))
+    board = paint(build, (150, 152, 154))
     forms.hang(
         build, moved(place, y_m=0.03), size, pictures.promotion(rng, size), up_m=height_m + size[1] / 2, frame=board,
         name="promotion", off_m=0.02,
@@ -190,8 +190,9 @@ def bin_of_goods(build: Builder, rng: np.random.Generator, place: Pose, articles
     """Add a wire bin full of packages that lie as they fell."""
     mesh = build.shared("mesh", _mesh)
     with build.thing("bin", place):
-        sides = {"+x": mesh, "-x": mesh, "+y": mesh, "-y": mesh}
-        shell(build, place, [0.0, 0.0, 0.4], [0.62, 0.62, 0.8], sides)
+        for yaw in np.arange(4) * np.pi / 2:
+            build.panel(forms.upright(moved(place, yaw_rad=yaw), 0.0, 0.31, 0.4), (0.62, 0.8), mesh, solid=False)
+        build.box(place, [0.0, 0.0, 0.36], [0.6, 0.6, 0.7], paint(build, (90, 92, 96)))
         for i in range(9):
             article = articles[int(rng.integers(len(articles)))]
             x, y = float(i % 3 - 1) * 0.19, float(i // 3 - 1) * 0.19
@@ -239,7 +240,7 @@ def pallet_of_goods(build: Builder, place: Pose, article: Product, *, layers: in
         for i in range(layers):
             z = 0.14 + i * tall + tall / 2
             faces = {"+y": front, "-y": front, "+x": tray, "-x": tray, "+z": tray}
-            shell(build, place, [0.0, 0.0, z], [wide, 0.6, tall - 0.01], faces)
+            shell(build, place, [0.0, 0.0, z], [wide, 0.6, tall], faces)
         build.block(place, (0.86, 0.66))
 
 
