@@ -19,6 +19,7 @@ from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
 from sim_bridge.sensors import effects
 from sim_bridge.stage.paths import FloorGraph, floor_graph
+from sim_bridge.stage.tours import largest_part
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,8 @@ FAMILY = "tag36h11"
 # White margin around the black square, in cells of the tag (the square has 8), and the board that carries the print.
 MARGIN_CELLS = 1
 BOARD_M, BOARD_THICKNESS_M, POLE_M = 0.19, 0.006, 0.025
+# Places on the floor from which walls are looked for.
+WALL_SPOTS = 400
 # A quick look that tells how much there is to see around a tag.
 _GLANCE = Camera("PINHOLE", 320, 240, (230.0, 230.0, 160.0, 120.0))
 
@@ -170,10 +173,10 @@ def richness(scene: Scene, world_from_cam: Pose) -> int:
 
 def _place_start(scene: Scene, options: StageOptions, *, rng: np.random.Generator) -> tuple[PlacedTag, Pose]:
     """Hang the start tag where the wall is bare and flat and the view of it, wall and room, is the richest."""
-    graph = floor_graph(scene, options.drive_radius_m)
+    graph = largest_part(floor_graph(scene, options.drive_radius_m))
     best: tuple[int, PlacedTag, Pose] | None = None
     seen = 0
-    for place in _bare_walls(scene, rng=rng):
+    for place in _bare_walls(scene, graph, rng=rng):
         tag = PlacedTag(options.start_tag_id, options.tag_size_m, place)
         body = _body_before(scene, graph, tag, options, rng=rng)
         if body is None or not _room_for_photos(scene, tag):
@@ -191,30 +194,42 @@ def _place_start(scene: Scene, options: StageOptions, *, rng: np.random.Generato
     return best[1], best[2]
 
 
-def _bare_walls(scene: Scene, *, rng: np.random.Generator) -> list[Pose]:
-    """Return world_from_tag of places at 0.5..0.8 m height where the wall is flat, free, and a tag fits; shuffled."""
-    x0, y0, x1, y1 = scene.floor_bounds
-    walls = [
-        ((x0, y0), (x1, y0), 90.0),
-        ((x1, y0), (x1, y1), 180.0),
-        ((x1, y1), (x0, y1), 270.0),
-        ((x0, y1), (x0, y0), 0.0),
-    ]
-    offsets = np.linspace(-0.13, 0.13, 7)
+def _bare_walls(scene: Scene, graph: FloorGraph, *, rng: np.random.Generator) -> list[Pose]:
+    """Return world_from_tag of places at 0.5..0.8 m height where the wall is flat, free, and a tag fits; shuffled.
+
+    Walls are what rays from the free floor meet within reach of the robot. A wall is taller than furniture.
+    """
+    spots = graph.centres[rng.permutation(len(graph.centres))[:WALL_SPOTS]]
+    yaws = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    eyes = np.column_stack([spots, rng.uniform(0.55, 0.8, len(spots))])
+    origins = np.repeat(eyes, len(yaws), axis=0)
+    rays = np.tile(np.column_stack([np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)]), (len(spots), 1))
+    distance, normal = scene.trace(origins, rays)
+    upright = (np.abs(normal[:, 2]) < 0.02) & ((normal * rays).sum(axis=1) < -0.5)
+    near = np.flatnonzero(upright & (distance > 0.4) & (distance < 1.6))
+    found = origins[near] + distance[near, None] * rays[near]
+    # One place per square of 15 cm is enough.
+    _, first = np.unique(np.floor(found[:, :2] / 0.15), axis=0, return_index=True)
     places = []
-    for start, end, yaw_deg in walls:
-        first, last = np.array(start), np.array(end)
-        length = float(np.linalg.norm(last - first))
-        for along in np.arange(0.3, length - 0.3, 0.15):
-            height = float(rng.uniform(0.55, 0.8))
-            foot = first + (last - first) * along / length
-            frame = facing([*foot, height], np.radians(yaw_deg))
-            grid = np.array([[x, y, 0.7] for x in offsets for y in offsets])
-            depth = scene.intersect(frame.apply(grid), frame.rotation.apply([0.0, 0.0, -1.0]))
-            # Rays that miss the wall have no depth.
-            if np.isfinite(depth).all() and np.ptp(depth) < 1e-3 and abs(float(depth[0]) - 0.7) < 0.05:
-                places.append(facing(frame.apply([0.0, 0.0, 0.7 - float(depth[0]) + 0.01]), np.radians(yaw_deg)))
-    return [places[k] for k in rng.permutation(len(places))]
+    for k in rng.permutation(first):
+        x, y, _ = normal[near[k]]
+        place = facing(found[k] + 0.01 * normal[near[k]], float(np.arctan2(y, x)))
+        if _is_wall(scene, place):
+            places.append(place)
+    return places
+
+
+def _is_wall(scene: Scene, world_from_tag: Pose) -> bool:
+    """Return whether a tag's surroundings are flat, and the surface behind it goes on to above a head's height."""
+    offsets = np.linspace(-0.13, 0.13, 7)
+    around = np.array([[x, y, 0.4] for x in offsets for y in offsets])
+    floor = -float(world_from_tag.translation[2])
+    above = np.array([[x, floor + z, 0.4] for x in (-0.1, 0.1) for z in (0.3, 1.1, 1.5, 1.8)])
+    back = world_from_tag.rotation.apply([0.0, 0.0, -1.0])
+    depth = scene.intersect(world_from_tag.apply(np.vstack([around, above])), back)
+    # Rays that miss the wall have no depth; pictures and door frames stand out from it a little.
+    flat = np.abs(depth[: len(around)] - 0.41) < 1e-3
+    return bool(flat.all() and (np.abs(depth[len(around) :] - 0.41) < 0.06).all())
 
 
 def _body_before(
@@ -261,8 +276,9 @@ def _place_waypoint(stage: Stage, options: StageOptions, *, index: int, rng: np.
     """Choose the free place that is farthest from the start and the other waypoints, with room for a tripod."""
     bodies = [stage.world_from_start, *(w.world_from_body for w in stage.waypoints)]
     taken = np.array([pose.translation[:2] for pose in (*bodies, *(t.world_from_tag for t in stage.tags))])
-    graph = floor_graph(stage.scene, options.waypoint_radius_m)
-    spots = graph.centres[rng.permutation(len(graph.centres))[:400]]
+    ways = largest_part(floor_graph(stage.scene, options.drive_radius_m))
+    roomy = ways.centres[stage.scene.free_floor(ways.centres, options.waypoint_radius_m)]
+    spots = roomy[rng.permutation(len(roomy))[:400]]
     far = np.linalg.norm(spots[:, None] - taken[None], axis=2).min(axis=1)
     for spot in spots[np.argsort(-far, kind="stable")][:80]:
         body = robot.standing(spot, float(rng.uniform(-np.pi, np.pi)))
@@ -302,8 +318,9 @@ def _with_tripod_near(
         if np.linalg.norm(keep_off - at, axis=1).min() < 1.0 or not _room_for_photos(scene, tag):
             continue
         arms = _truth_arms(scene, body, tag, options, rng=rng)
-        graph = floor_graph(with_tag(scene, tag), options.drive_radius_m)
-        if len(arms) < options.truth_sightings or not graph.connects(points):
+        if len(arms) < options.truth_sightings:
+            continue
+        if not floor_graph(with_tag(scene, tag), options.drive_radius_m).connects(points):
             continue
         value = _background(scene, tag)
         if best is None or value > best[0]:
