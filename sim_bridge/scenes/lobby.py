@@ -135,8 +135,7 @@ def _hang(
 
 
 def _picture(rng: np.random.Generator, size_m: tuple[float, float]) -> textures.Rgb:
-    kind = str(rng.choice(list(textures.PICTURES)))
-    return textures.PICTURES[kind](rng, px(size_m))
+    return office_prints.printed(rng, px(size_m))
 
 
 def _reception(build: Builder, rng: np.random.Generator, look: Make) -> None:
@@ -190,9 +189,8 @@ def _boards(build: Builder, rng: np.random.Generator, look: Make) -> None:
     """Add free-standing boards, a rack, an information screen, and pictures on the large walls."""
     spots = ((10.2, 3.95, 2.6), (7.3, 1.3, 1.5), (3.1, 0.55, 0.2))
     for i, (x, y, yaw) in enumerate(spots):
-        kinds = [textures.PICTURES[str(k)] for k in rng.choice(list(textures.PICTURES), 2)]
-        front = kinds[0](rng, px((0.94, 1.34), px_per_m=320))
-        back = kinds[1](rng, px((0.94, 1.34), px_per_m=320)) if i != 2 else None
+        front = _picture(rng, (0.94, 1.34))
+        back = _picture(rng, (0.94, 1.34)) if i != 2 else None
         spot = yaw_pose([x, y, 0.0], yaw + float(rng.normal(0, 0.15)))
         furniture.display(build, look, spot, front, back)
     furniture.rack(build, rng, look, wall_frame(*_SOUTH, 1.9))
@@ -222,7 +220,7 @@ def _waiting_room(build: Builder, rng: np.random.Generator, look: Make) -> None:
     size = (1.1, 0.75)
     _hang(build, _WEST, WIDTH_M - 7.4, size, office_prints.cork(rng, px(size)), up_m=1.5, name="notices")
     size = (0.75, 1.0)
-    _hang(build, _WAITING_EAST, 1.2, size, textures.shapes(rng, px(size)), up_m=1.5)
+    _hang(build, _WAITING_EAST, 1.2, size, office_prints.emblem(rng, px(size)), up_m=1.5)
     size = (0.6, 0.84)
     _hang(build, _WAITING_SOUTH, 1.5, size, _picture(rng, size), up_m=1.5)
     furniture.kiosk(build, rng, look, yaw_pose([3.4, 8.5, 0.0], np.pi + 0.2))

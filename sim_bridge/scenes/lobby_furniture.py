@@ -171,7 +171,7 @@ def banner(build: Builder, rng: np.random.Generator, look: Make, place: Pose, *,
         for x in (-0.35, 0.35):
             build.box(place, [x, 0.0, ceiling_m - 0.17], [0.008, 0.008, 0.34], look.dark, solid=False)
         for yaw in (0.0, np.pi):
-            image = build.texture(prints.banner(rng, px(size, px_per_m=300)))
+            image = build.texture(prints.banner(rng, px(size)))
             build.panel(on_wall(moved(place, yaw_rad=yaw), 0.0, up, off_m=0.002), size, image, solid=False)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sim_bridge.scenes import textures
-from sim_bridge.scenes.office_prints import flecked
+from sim_bridge.scenes.office_prints import flecked, mosaic
 from sim_bridge.scenes.textures import Rgb, colour, fractal, tinted, write_lines
 
 Size = tuple[int, int]
@@ -126,7 +126,7 @@ def banner(rng: np.random.Generator, size: Size) -> Rgb:
     disc = (width // 2, top // 2)
     for i in range(4):
         cv2.circle(image, disc, int(0.42 * top * (1 - i / 4)), colour(rng), -1, cv2.LINE_AA)
-    kind = textures.photo if rng.random() < 0.5 else textures.shapes
+    kind = textures.photo if rng.random() < 0.4 else mosaic
     picture = kind(rng, (int(0.4 * height), width))
     image[top : top + len(picture)] = picture
     box = (width // 14, top + len(picture), width - width // 14, height - 4)

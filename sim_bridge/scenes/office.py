@@ -181,13 +181,12 @@ def _ceilings(build: Builder, rng: np.random.Generator) -> None:
 
 
 def _picture(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
-    kind = str(rng.choice(list(textures.PICTURES)))
-    return textures.PICTURES[kind](rng, px(size_m))
+    return prints.printed(rng, px(size_m))
 
 
 def _poster(build: Builder, rng: np.random.Generator, place: Pose, *, large: float = 1.0) -> None:
     """Hang a poster on a wall's frame, at eye height or a little lower."""
-    width = large * float(rng.uniform(0.55, 0.8))
+    width = large * float(rng.uniform(0.65, 0.95))
     size = (width, width * float(rng.uniform(1.0, 1.4)))
     at = on_wall(place, 0.0, float(rng.uniform(1.35, 1.55)), off_m=0.0)
     hang(build, at, size, _picture(rng, size))
@@ -207,7 +206,7 @@ def _open_plan(build: Builder, rng: np.random.Generator, look: Style) -> None:
         ends = [-np.pi / 2, np.pi / 2]
         for yaw in ends if rng.random() < 0.4 else [float(rng.choice(ends))]:
             outwards = moved(place, yaw_rad=yaw)
-            _board(build, rng, moved(outwards, float(rng.uniform(-0.35, 0.35)), 1.656), width_m=0.75, up_m=1.02)
+            _board(build, rng, moved(outwards, float(rng.uniform(-0.35, 0.35)), 1.656), width_m=0.9, up_m=0.92)
     for i, x in enumerate(np.arange(3.6, 8.2, 0.9)):
         tall = i in (0, 1, 4)
         front = FRONT.right(float(x))

@@ -19,7 +19,7 @@ from sim_bridge.scenes.textures import Rgb
 
 DESK_M = (1.6, 0.8)
 DESK_TOP_M = 0.74
-_PRINT_PX_PER_M = 360
+_PRINT_PX_PER_M = 240
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,12 +144,6 @@ def screen_image(build: Builder, rng: np.random.Generator) -> int:
     return build.texture(textures.screen(rng, (180, 300)))
 
 
-def pinned_print(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
-    """Draw what people pin up: a notice, a photograph, a drawing, a chart."""
-    kind = str(rng.choice(list(textures.PICTURES)))
-    return textures.PICTURES[kind](rng, px(size_m))
-
-
 def workplace(build: Builder, rng: np.random.Generator, look: Style, place: Pose, *, pinned: bool = False) -> None:
     """Add a desk with a screen, a keyboard, a chair and someone's things; ``pinned`` prints hang behind it."""
     desk(build, look, place)
@@ -164,10 +158,10 @@ def workplace(build: Builder, rng: np.random.Generator, look: Style, place: Pose
     if pinned:
         for side in (-1, 1):
             if rng.random() < 0.75:
-                size = (float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.28, 0.4)))
+                size = (float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.28, 0.38)))
                 along = float(np.clip(x + side * 0.48, -0.54, 0.54))
-                spot = on_wall(place, along, 1.04, off_m=-0.01)
-                hang(build, spot, size, pinned_print(rng, size), name="pinned")
+                spot = on_wall(place, along, 0.97, off_m=-0.01)
+                hang(build, spot, size, office_prints.printed(rng, px(size)), name="pinned")
     back = moved(place, float(rng.normal(0, 0.1)), 0.8, yaw_rad=float(rng.normal(0, 0.3)))
     chair(build, look, back)
 
@@ -200,10 +194,10 @@ def bench(build: Builder, rng: np.random.Generator, look: Style, place: Pose, *,
     w, d = DESK_M
     length = desks * w
     with build.thing("partition", place, kind="fixed"):
-        build.box(place, [0.0, 0.0, 0.7], [length, 0.04, 1.2], look.screen)
+        build.box(place, [0.0, 0.0, 0.64], [length, 0.04, 1.08], look.screen)
         for side in (-1, 1):
-            build.box(place, [side * (length / 2 + 0.03), 0.0, 0.72], [0.05, 2 * d + 0.04, 1.36], look.screen)
-            build.box(place, [side * (length / 2 + 0.03), 0.0, 1.41], [0.055, 2 * d + 0.05, 0.02], look.metal)
+            build.box(place, [side * (length / 2 + 0.03), 0.0, 0.65], [0.05, 2 * d + 0.04, 1.22], look.screen)
+            build.box(place, [side * (length / 2 + 0.03), 0.0, 1.27], [0.055, 2 * d + 0.05, 0.02], look.metal)
         build.block(place, (length + 0.12, 0.1))
         for side in (-1, 1):
             build.block(moved(place, side * (length / 2 + 0.03)), (0.06, 2 * d + 0.05))
@@ -284,9 +278,9 @@ def hanging_sign(build: Builder, rng: np.random.Generator, place: Pose, *, ceili
         for x in (-0.5, 0.5):
             build.box(place, [x, 0.0, ceiling_m - 0.06], [0.012, 0.012, 0.12], rim, solid=False)
         base = textures.colour(rng, low=40, high=140)
-        letters = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVW"), 7))
-        image = build.texture(office_prints.sign(rng, px(size, px_per_m=240), text=letters, base=base))
         for yaw in (0.0, np.pi):
+            letters = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVW"), 7))
+            image = build.texture(office_prints.sign(rng, px(size), text=letters, base=base))
             build.panel(on_wall(moved(place, yaw_rad=yaw), 0.0, up, off_m=0.012), size, image, solid=False)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from sim_bridge.scenes import textures
 from sim_bridge.scenes.textures import Rgb, colour, fractal, tinted, to_bytes, write_lines
@@ -161,6 +163,84 @@ def cork(rng: np.random.Generator, size: Size) -> Rgb:
         _paste(image, sheet, (x, y), angle_deg=float(rng.normal(0, 5)))
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), (96, 78, 60), max(height // 45, 3))
     return image
+
+
+def mosaic(rng: np.random.Generator, size: Size) -> Rgb:
+    """Draw a picture of plain cells of many colours with dark joints, a twelfth of the picture wide or less."""
+    height, width = size
+    count = int(rng.integers(60, 110))
+    seeds = rng.uniform((0, 0), (width, height), (count, 2))
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    distance, cell = (np.asarray(part) for part in cKDTree(seeds).query(np.stack([x, y], axis=-1), k=2))
+    palette = np.array([colour(rng, low=20, high=245) for _ in range(count)], np.uint8)
+    image = palette[cell[..., 0]]
+    image[distance[..., 1] - distance[..., 0] < max(size) / 110] = 25
+    return np.ascontiguousarray(image)
+
+
+def emblem(rng: np.random.Generator, size: Size) -> Rgb:
+    """Draw large crisp discs, polygons and bars over each other."""
+    height, width = size
+    image = np.empty((height, width, 3), np.uint8)
+    image[:] = colour(rng, low=110, high=250)
+    scale = min(size)
+    for _ in range(int(rng.integers(22, 36))):
+        middle = np.array([rng.uniform(0, width), rng.uniform(0, height)])
+        radius = scale * float(rng.uniform(0.03, 0.16))
+        kind = rng.integers(3)
+        if kind == 0:
+            cv2.circle(image, middle.astype(int).tolist(), int(radius), colour(rng, low=0, high=255), -1, cv2.LINE_AA)
+            cv2.circle(image, middle.astype(int).tolist(), int(radius / 2), colour(rng), -1, cv2.LINE_AA)
+        elif kind == 1:
+            turns = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 6))))
+            points = middle + 1.3 * radius * np.column_stack([np.cos(turns), np.sin(turns)])
+            cv2.fillPoly(image, [points.astype(np.int32)], colour(rng, low=0, high=255), cv2.LINE_AA)
+        else:
+            end = middle + 2.0 * radius * rng.normal(size=2)
+            thick = max(2, int(radius / 3))
+            cv2.line(image, middle.astype(int).tolist(), end.astype(int).tolist(), colour(rng), thick, cv2.LINE_AA)
+    return image
+
+
+def placard(rng: np.random.Generator, size: Size) -> Rgb:
+    """Draw a few lines of large letters on bands of colour."""
+    height, width = size
+    image = np.empty((height, width, 3), np.uint8)
+    edges = np.sort(np.concatenate([[0.0, 1.0], rng.uniform(0.12, 0.88, int(rng.integers(3, 6)))]))
+    for top, bottom in itertools.pairwise((edges * height).astype(int)):
+        image[top:bottom] = colour(rng, low=120, high=250)
+        line = int(np.clip((bottom - top) * 0.7, 12, height / 7))
+        if bottom - top > 14:
+            box = (width // 30, top, width - width // 30, bottom)
+            _large_letters(rng, image, box, line_px=line)
+    return image
+
+
+def _large_letters(rng: np.random.Generator, image: Rgb, box: tuple[int, int, int, int], *, line_px: int) -> None:
+    x0, y0, x1, y1 = box
+    thick, scale, ink = max(2, line_px // 7), line_px / 32, colour(rng, low=0, high=110)
+    for y in range(y0 + line_px, y1 + 1, int(1.3 * line_px)):
+        x = x0
+        while x < x1 - line_px:
+            letter = str(rng.choice(list("ABCDEFGHJKLMNPQRSTUVWXYZ23456789")))
+            cv2.putText(image, letter, (x, y - line_px // 6), cv2.FONT_HERSHEY_DUPLEX, scale, ink, thick, cv2.LINE_AA)
+            x += int(line_px * rng.choice([0.8, 0.8, 0.8, 1.5]))
+
+
+# Kinds of prints on walls: all with structure of 2 to 15 cm on a print of ordinary size.
+PRINTS: dict[str, Callable[[np.random.Generator, Size], Rgb]] = {
+    "page": textures.page,
+    "photo": textures.photo,
+    "chart": textures.chart,
+    "mosaic": mosaic,
+    "emblem": emblem,
+    "placard": placard,
+}
+
+
+def printed(rng: np.random.Generator, size: Size) -> Rgb:
+    """Draw a print of a random kind."""
+    return PRINTS[str(rng.choice(list(PRINTS)))](rng, size)
 
 
 def note(rng: np.random.Generator, size: Size) -> Rgb:
