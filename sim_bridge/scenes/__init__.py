@@ -11,6 +11,7 @@ from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Scene
 from sim_bridge.scenes.blueprint import Blueprint
 from sim_bridge.scenes.clinic import clinic
+from sim_bridge.scenes.laboratory import laboratory
 from sim_bridge.scenes.library import library
 from sim_bridge.scenes.light import lit
 from sim_bridge.scenes.lobby import lobby
@@ -27,6 +28,7 @@ SCENES: dict[str, Callable[[int], Blueprint]] = {
     "room": furnished_room,
     "office": office,
     "lobby": lobby,
+    "laboratory": laboratory,
     "shop": shop,
     "library": library,
     "clinic": clinic,
