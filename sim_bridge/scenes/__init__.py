@@ -20,6 +20,7 @@ from sim_bridge.scenes.office import office
 from sim_bridge.scenes.room import furnished_room
 from sim_bridge.scenes.school import school
 from sim_bridge.scenes.shop import shop
+from sim_bridge.scenes.workshop import workshop
 
 __all__ = ["SCENES", "make_blueprint", "make_scene"]
 
@@ -29,6 +30,7 @@ SCENES: dict[str, Callable[[int], Blueprint]] = {
     "office": office,
     "lobby": lobby,
     "laboratory": laboratory,
+    "workshop": workshop,
     "shop": shop,
     "library": library,
     "clinic": clinic,
