@@ -214,7 +214,7 @@ def read_shard(path: Path) -> Shard:
         raise StoreError(f"{path}: no such file; expected a shard of a dataset", hint="finish the dataset") from error
     except FieldkitError:
         raise
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise StoreError(f"{path}: not a readable shard: {error}", hint="remove it and finish the dataset") from error
 
 
