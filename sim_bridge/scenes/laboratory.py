@@ -100,14 +100,13 @@ def _wet_laboratory(build: Builder, rng: np.random.Generator, look: Ware) -> Non
         for side in (0.0, np.pi):
             turned = moved(place, yaw_rad=side)
             front = moved(turned, 0.0, 0.45, furniture.BENCH_TOP_M)
-            furniture.clutter(build, rng, look, front, width_m=2.6, count=int(rng.integers(3, 5)))
+            furniture.clutter(build, rng, look, front, width_m=2.6, count=int(rng.integers(2, 4)))
             for x in (-1.05, 0.0, 1.05):
                 if rng.random() < 0.75:
                     spot = moved(turned, x + float(rng.normal(0, 0.1)), 0.68, yaw_rad=float(rng.uniform(0, 3)))
                     furniture.stool(build, look, spot)
-        for yaw in (-np.pi / 2, np.pi / 2):
-            end = moved(moved(place, yaw_rad=yaw), y_m=1.5)
-            _print(build, rng, end, (0.62, 0.5), up_m=0.52)
+        end = moved(moved(place, yaw_rad=float(rng.choice([-1, 1])) * np.pi / 2), y_m=1.5)
+        _print(build, rng, end, (0.62, 0.5), up_m=0.52)
     for y in (2.1, 3.65, 5.2):
         furniture.hood(build, rng, look, HALL.on(WEST, HALL.width_m - y))
     furniture.gas_bottles(build, rng, HALL.on(WEST, HALL.width_m - 0.55), count=3)
@@ -116,15 +115,15 @@ def _wet_laboratory(build: Builder, rng: np.random.Generator, look: Ware) -> Non
 def _wet_walls(build: Builder, rng: np.random.Generator, look: Ware) -> None:
     """Add glass cupboards, boards, posters, and a bench with screens along the divider."""
     for x in (0.95, 1.97, 2.99):
-        furniture.glass_cupboard(build, rng, look, HALL.on(NORTH, HALL.length_m - x), same=x > 2.0)
+        furniture.glass_cupboard(build, rng, look, HALL.on(NORTH, HALL.length_m - x), same=x > 1.0)
     size = (1.7, 1.1)
     board = HALL.on(NORTH, HALL.length_m - 4.6)
     _print(build, rng, board, size, image=prints.formulae(rng, px(size)), name="board", up_m=1.45)
     _print(build, rng, HALL.on(NORTH, HALL.length_m - 6.1), (0.7, 0.95))
     _print(build, rng, HALL.on(WEST, HALL.width_m - 6.6), (0.8, 1.05), up_m=1.45)
+    _print(build, rng, HALL.on(WEST, HALL.width_m - 0.65), (0.7, 0.5), up_m=1.78)
     for x in (0.5, 3.4, 6.4):
         _print(build, rng, HALL.on(SOUTH, x), (0.75, 1.0), up_m=1.45)
-    _print(build, rng, HALL.on(WEST, HALL.width_m - 0.75), (0.6, 0.45), up_m=1.95)
     side = wall_frame(*_DIVIDER, 3.85)
     furniture.bench(build, look, side, units=4, depth_m=0.55)
     for x in (-0.75, 0.7):
@@ -159,8 +158,7 @@ def _instrument_room(build: Builder, rng: np.random.Generator, look: Ware) -> No
             spot = moved(half, x, 0.22, furniture.BENCH_TOP_M, yaw_rad=float(rng.normal(0, 0.06)))
             size = (float(rng.uniform(0.45, 0.6)), 0.34, float(rng.uniform(0.3, 0.6)))
             furniture.instrument(build, rng, look, spot, size=size)
-    for y, yaw in ((3.54, np.pi), (5.96, 0.0)):
-        _print(build, rng, yaw_pose([9.1, y, 0.0], yaw), (0.62, 0.5), up_m=0.52)
+    _print(build, rng, yaw_pose([9.1, 5.96, 0.0], 0.0), (0.62, 0.5), up_m=0.52)
     for x, y in ((8.75, 6.25), (9.4, 6.28), (9.1, 3.2)):
         furniture.stool(build, look, yaw_pose([x, y, 0.0], float(rng.uniform(0, 3))))
     for at in (3.0, 3.92, 4.84):
@@ -172,8 +170,8 @@ def _instrument_room(build: Builder, rng: np.random.Generator, look: Ware) -> No
 def _instrument_walls(build: Builder, rng: np.random.Generator, look: Ware) -> None:
     for at, size, up in (
         (2.5, (0.8, 1.05), 1.45),
-        (4.1, (1.0, 0.7), 1.9),
-        (5.7, (1.1, 0.75), 1.9),
+        (4.1, (0.8, 0.6), 1.75),
+        (5.7, (0.8, 0.6), 1.75),
         (7.4, (0.8, 1.0), 1.5),
     ):
         _print(build, rng, HALL.on(EAST, at), size, up_m=up)
@@ -209,7 +207,7 @@ def _corridor(build: Builder, rng: np.random.Generator, look: Ware) -> None:
     furniture.clutter(build, rng, look, moved(low, 0.0, 0.22, 1.0), width_m=0.8, count=2)
     _print(build, rng, low, (0.6, 0.75), image=textures.page(rng, px((0.6, 0.75))), up_m=1.75)
     furniture.shower(build, look, HALL.on(SOUTH, 10.03))
-    for x, y, yaw in ((7.75, 0.9, np.pi / 2), (3.65, 3.85, 0.0), (9.1, 7.0, 0.0)):
+    for x, y, yaw in ((7.75, 0.9, np.pi / 2), (9.1, 7.0, 0.0)):
         _hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw))
 
 

@@ -10,7 +10,7 @@ from fieldkit.frames import Pose
 from sim_bridge.scenes import laboratory_prints as prints
 from sim_bridge.scenes import textures
 from sim_bridge.scenes.blueprint import Builder
-from sim_bridge.scenes.forms import hang, moved, prism, upright
+from sim_bridge.scenes.forms import moved, prism, upright
 from sim_bridge.scenes.office_prints import fronts
 from sim_bridge.scenes.textures import Rgb
 
@@ -104,20 +104,17 @@ def island(build: Builder, rng: np.random.Generator, look: Ware, place: Pose, *,
 
 
 def _reagents(build: Builder, rng: np.random.Generator, look: Ware, place: Pose, width: float) -> None:
-    """Add the rows of bottles on an island's shelves; the lower rows are of three sorts that come again."""
-    wide = width / 2 - 0.08
-    for z, high in ((1.13, 0.26), (1.49, 0.24)):
-        for x in (-width / 4, width / 4):
-            if z > 1.4 and rng.random() < 0.35:
-                continue
-            rows = []
-            for _ in range(2):
-                if z < 1.4 and rng.random() < 0.4:
-                    key = ("reagents", int(rng.integers(2)))
-                    rows.append(build.shared(key, lambda: prints.bottles(rng, px((wide, 0.26)), rows=1, full=0.9)))
-                else:
-                    rows.append(build.texture(prints.bottles(rng, px((wide, high)), rows=1, full=0.85)))
-            build.box(place, [x, 0.0, z + high / 2], [wide, 0.2, high], look.glass, sides={2: rows[0], 3: rows[1]})
+    """Add rows of bottles on an island's lower shelf, most of two sorts, and a closed unit on half of the upper one."""
+    wide, closed = width / 2 - 0.08, float(rng.choice([-1.0, 1.0]))
+    for x in (-width / 4, width / 4):
+        rows = []
+        for _ in range(2):
+            sort = int(rng.integers(3))
+            key = ("reagents", sort if sort < 2 else len(build.textures))
+            rows.append(build.shared(key, lambda: prints.bottles(rng, px((wide, 0.26)), rows=1, full=0.9)))
+        build.box(place, [x, 0.0, 1.26], [wide, 0.2, 0.26], look.glass, sides={2: rows[0], 3: rows[1]})
+        if x * closed > 0:
+            build.box(place, [x, 0.0, 1.73], [wide + 0.06, 0.28, 0.48], look.side, sides={2: look.front, 3: look.front})
 
 
 def hood(build: Builder, rng: np.random.Generator, look: Ware, place: Pose) -> None:
@@ -140,12 +137,6 @@ def hood(build: Builder, rng: np.random.Generator, look: Ware, place: Pose) -> N
             place, [0.0, deep - 0.03, 1.3 + 0.1 * float(rng.integers(0, 4))], [wide - 0.2, 0.03, 0.05], look.steel
         )
         build.block(moved(place, y_m=deep / 2), (wide, deep + 0.02))
-    if rng.random() < 0.7:
-        size = (0.5, 0.36)
-        at = moved(place, y_m=deep)
-        hang(
-            build, at, size, prints.hazards(rng, px(size)), along_m=float(rng.uniform(-0.4, 0.4)), up_m=2.1, name="sign"
-        )
 
 
 def glass_cupboard(build: Builder, rng: np.random.Generator, look: Ware, place: Pose, *, same: bool = False) -> None:

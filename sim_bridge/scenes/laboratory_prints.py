@@ -307,7 +307,7 @@ def vinyl(rng: np.random.Generator, size: Size, *, base: ArrayLike, px_per_m: fl
     height, width = size
     image = tinted(base, 3.0 * fractal(rng, size, cell_px=0.6 * px_per_m, octaves=5))
     ground = image.reshape(-1, 3).mean(axis=0)
-    for _ in range(int(9 * height * width / px_per_m**2)):
+    for _ in range(int(4 * height * width / px_per_m**2)):
         spot = (int(rng.uniform(0, width)), int(rng.uniform(0, height)))
         ink = [int(v) for v in np.clip(ground + rng.normal(0, 20), 0, 255)]
         axes = (int(px_per_m * rng.uniform(0.005, 0.03)) + 1, int(px_per_m * rng.uniform(0.004, 0.015)) + 1)

@@ -119,7 +119,7 @@ def _benches(build: Builder, rng: np.random.Generator, look: Gear) -> None:
         place = HALL.on(NORTH, HALL.length_m - x)
         furniture.workbench(build, look, place)
         top = moved(place, -0.2, 0.36, furniture.BENCH_TOP_M)
-        furniture.parts(build, rng, look, top, width_m=1.2, count=int(rng.integers(2, 4)))
+        furniture.parts(build, rng, look, top, width_m=1.2, count=int(rng.integers(1, 3)))
         if i == 2:
             furniture.bin_wall(build, rng, place, width_m=1.4)
         else:
@@ -127,8 +127,8 @@ def _benches(build: Builder, rng: np.random.Generator, look: Gear) -> None:
         if rng.random() < 0.8:
             spot = moved(place, float(rng.uniform(-0.2, 0.5)), 0.95, yaw_rad=float(rng.normal(0, 0.3)))
             furniture.stool(build, look, spot)
-    for x in (2.35, 4.65, 6.95, 9.6):
-        _print(build, rng, HALL.on(NORTH, HALL.length_m - x), (0.5, 0.7), up_m=1.75)
+    for x in (4.65, 9.6):
+        _print(build, rng, HALL.on(NORTH, HALL.length_m - x), (0.5, 0.7), up_m=1.5)
 
 
 def _machines(build: Builder, rng: np.random.Generator, look: Gear) -> None:
@@ -154,8 +154,7 @@ def _stores(build: Builder, rng: np.random.Generator, look: Gear) -> None:
     furniture.screen(build, rng, look, yaw_pose([7.35, 5.55, 0.0], np.pi + float(rng.normal(0, 0.05))))
     for x, y in ((9.85, 0.4), (9.2, 0.35), (9.85, 7.0)):
         furniture.drum(build, rng, yaw_pose([x, y, 0.0], float(rng.uniform(0.5, 2.2))))
-    for x in (4.9, 6.8):
-        _print(build, rng, moved(HALL.on(SOUTH, x), y_m=0.0), (1.3, 0.38), up_m=2.3, name="banner")
+    _print(build, rng, HALL.on(SOUTH, 5.85), (1.3, 0.38), up_m=1.95, name="banner")
     _print(build, rng, HALL.on(SOUTH, 9.4), (0.8, 1.05), up_m=1.65)
 
 
@@ -174,7 +173,7 @@ def _gate(build: Builder, rng: np.random.Generator, look: Gear) -> None:
         _print(build, rng, HALL.on(EAST, at), size, up_m=1.5)
     size = (0.75, 0.55)
     _print(build, rng, moved(place, y_m=0.04), size, image=prints.warning(rng, px(size)), up_m=1.35, name="sign")
-    for x, y, yaw in ((3.7, 3.65, np.pi / 2), (6.3, 1.4, np.pi / 2), (8.6, 5.4, 0.0)):
+    for x, y, yaw in ((3.7, 3.65, np.pi / 2),):
         _hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw))
 
 

@@ -141,10 +141,11 @@ def pallet(build: Builder, look: Gear, place: Pose) -> None:
 
 
 def crate(build: Builder, rng: np.random.Generator, place: Pose, size: tuple[float, float, float]) -> None:
-    """Add a crate of (width, depth, height) whose long sides are stencilled alike, its short sides alike."""
+    """Add a crate of (width, depth, height) whose long sides are stencilled alike, one of three sorts."""
     wide, deep, high = size
-    long = build.texture(prints.crate_side(rng, px((wide, high), px_per_m=240)))
-    short = build.texture(prints.crate_side(rng, px((deep, high), px_per_m=240)))
+    sort = int(rng.integers(3))
+    long = build.shared(("crate", sort), lambda: prints.crate_side(rng, px((wide, high), px_per_m=240)))
+    short = build.shared(("crate end", sort), lambda: prints.crate_side(rng, px((deep, high), px_per_m=240)))
     with build.thing("crate", place):
         top = paint(build, (178, 142, 96))
         sides = {0: short, 1: short, 2: long, 3: long}
@@ -161,7 +162,7 @@ def loaded_pallet(build: Builder, rng: np.random.Generator, look: Gear, place: P
                 at = moved(
                     place, x, float(rng.normal(0, 0.01)), 0.141 + 0.401 * layer, yaw_rad=float(rng.normal(0, 0.03))
                 )
-                if rng.random() < 0.5:
+                if rng.random() < 0.75:
                     crate(build, rng, at, (0.55, 0.7, 0.4))
                 else:
                     face = build.texture(textures.cardboard(rng, px((0.55, 0.4), px_per_m=240)))
@@ -196,14 +197,14 @@ def _stored(build: Builder, rng: np.random.Generator, at: Pose, size: tuple[floa
     wide, high = size
     with build.thing("stored box", at):
         kind = rng.random()
-        if kind < 0.45:
+        if kind < 0.7:
             tone = (92, 100, 110)
             front = build.shared(
                 ("grey box", size), lambda: prints.bins(rng, px(size, px_per_m=220), cols=1, rows=1, tone=tone)
             )
             build.box(at, [0.0, 0.0, high / 2], [wide, 0.44, high], paint(build, tone), front=front)
         else:
-            draw = prints.crate_side if kind < 0.7 else textures.cardboard
+            draw = prints.crate_side if kind < 0.85 else textures.cardboard
             front = build.texture(draw(rng, px(size, px_per_m=260)))
             build.box(at, [0.0, 0.0, high / 2], [wide, 0.44, high], paint(build, (170, 134, 92)), front=front)
 

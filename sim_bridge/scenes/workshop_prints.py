@@ -278,12 +278,12 @@ def concrete(rng: np.random.Generator, size: Size, *, base: ArrayLike, px_per_m:
     image = tinted(base, 5.0 * fractal(rng, size, cell_px=1.2 * px_per_m, octaves=6))
     area = height * width / px_per_m**2
     ground = np.asarray(base, dtype=np.float64)
-    for _ in range(int(5 * area)):
+    for _ in range(int(3 * area)):
         spot = (int(rng.uniform(0, width)), int(rng.uniform(0, height)))
         axes = tuple(int(px_per_m * v) + 1 for v in rng.uniform(0.006, 0.05, 2))
         ink = [int(v) for v in np.clip(ground + rng.normal(-10, 20), 0, 255)]
         cv2.ellipse(image, spot, axes, float(rng.uniform(0, 180)), 0, 360, ink, -1, cv2.LINE_AA)
-    for _ in range(int(0.5 * area)):
+    for _ in range(int(0.3 * area)):
         start = rng.uniform((0, 0), (width, height))
         path = start + np.cumsum(rng.normal(0, 0.06 * px_per_m, (12, 2)) + rng.normal(0, 0.05 * px_per_m, 2), axis=0)
         ink = [int(v) for v in np.clip(ground - 34, 0, 255)]
