@@ -30,7 +30,6 @@ from fieldkit.maps.io import (
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
 from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
 from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
-from fieldkit.maps.rigs import contradicting
 from fieldkit.maps.sfm import reconstruct, threads
 from fieldkit.maps.source import DepthFrame, MapSource, read_source
 from fieldkit.store import atomic_folder
@@ -125,7 +124,7 @@ def build_map(
     clock.lap("reconstruct")
     sfm_poses = _registered(walk, model, options)
     alignment, warnings = _align(walk, model, sfm_poses, options, seed)
-    mapped, left_out = _placed(walk, model, sfm_poses, alignment)
+    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
     n_landmarks = _finish_model(walk, model, alignment.map_from_sfm, options.landmarks)
     clock.lap("align")
     surface, missing = _surface(walk, mapped, options, tell)
@@ -137,7 +136,7 @@ def build_map(
         places = _alignment_entry(alignment), _surface_entry(surface, options)
         write_map_file(folder, MapFile(1, digest, feature, *counts, *places))
     clock.lap("write")
-    found = (*warnings, *left_out, *missing)
+    found = (*warnings, *missing)
     return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, found)
 
 
@@ -230,19 +229,6 @@ def _scale_by_depth(
         sfm_centres=np.stack([sfm_poses[i].translation for i in posed]),
         slam_centres=np.stack([p.translation for p in posed.values()]),
     )
-
-
-def _placed(
-    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], alignment: Alignment
-) -> tuple[dict[int, Pose], list[str]]:
-    """Return map_from_cam by image index; images that contradict the rig leave the model, with a warning each."""
-    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
-    left_out = []
-    for i in contradicting(walk.images, mapped):
-        left_out.append(f"{walk.images[i].name} left out: its pose contradicts the rig")
-        model.deregister_frame(i + 1)
-        del mapped[i]
-    return mapped, left_out
 
 
 def _finish_model(

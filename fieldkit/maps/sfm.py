@@ -12,11 +12,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
 from fieldkit.features import Features
-from fieldkit.maps.landmarks import colmap_camera
 from fieldkit.maps.pairs import Pair
+from fieldkit.maps.rigs import write_cameras
 from fieldkit.maps.source import SourceImage
 
 # Below this number of verified matches a pair is not used (COLMAP's own bound).
@@ -41,23 +40,10 @@ def write_database(
     pairs: Sequence[Pair],
     matches: Sequence[NDArray[np.uint32]],
 ) -> None:
-    """Write cameras, images (id = index + 1), keypoints and matches into a new COLMAP database."""
+    """Write rigs, cameras, images (id = index + 1), keypoints and matches into a new COLMAP database."""
     with contextlib.closing(pycolmap.Database.open(path)) as database, pycolmap.DatabaseTransaction(database):
-        camera_ids: dict[tuple[str, Camera], int] = {}
-        for i, (image, found) in enumerate(zip(images, features, strict=True), start=1):
-            key = (image.sequence, image.camera)
-            if key not in camera_ids:
-                camera_ids[key] = len(camera_ids) + 1
-                camera = colmap_camera(image.camera, camera_ids[key])
-                database.write_camera(camera, use_camera_id=True)
-                rig = pycolmap.Rig(rig_id=camera_ids[key])
-                rig.add_ref_sensor(camera.sensor_id)
-                database.write_rig(rig, use_rig_id=True)
-            row = pycolmap.Image(name=image.name, camera_id=camera_ids[key], image_id=i)
-            database.write_image(row, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=i, rig_id=camera_ids[key])
-            frame.add_data_id(row.data_id)
-            database.write_frame(frame, use_frame_id=True)
+        write_cameras(database, images)
+        for i, found in enumerate(features, start=1):
             database.write_keypoints(i, found.keypoints_px.astype(np.float32))
         for (a, b), found_matches in zip(pairs, matches, strict=True):
             if len(found_matches) >= _MIN_MATCHES:
@@ -87,7 +73,8 @@ def reconstruct(
 ) -> pycolmap.Reconstruction:
     """Reconstruct cameras and points; return the model with the most images, in SfM's own scale and frame.
 
-    Intrinsics stay fixed. Raises MapError when no pair of images can be verified or no model grows.
+    Intrinsics and the geometry of a rig stay fixed: a rig's images are placed together, and in metres. Raises MapError
+    when no pair of images can be verified or no model grows.
     """
     with tempfile.TemporaryDirectory(prefix="fieldkit-sfm-") as folder, quiet_colmap():
         database = Path(folder) / "database.db"
@@ -126,6 +113,7 @@ def _mapping_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     options.ba_refine_focal_length = False
     options.ba_refine_principal_point = False
     options.ba_refine_extra_params = False
+    options.ba_refine_sensor_from_rig = False
     options.min_model_size = 3
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
