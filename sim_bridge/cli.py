@@ -36,13 +36,15 @@ def synthesize(
     without: tuple[str, ...] = (),
     lens: Literal["none", "radtan", "fisheye"] | None = None,
     changes: str = "standard",
+    unit: Literal["m", "cm", "mm"] | None = None,
+    up: Literal["z", "y"] | None = None,
     force: bool = False,
 ) -> None:
     """Synthesize a session: mapping walk, photos of tags, robot recording, and the truth.
 
     Args:
         out: session folder to write
-        scene: name of a scene
+        scene: name of a scene, or a mesh of a building: a .glb, .obj or .ply file
         seed: the same seed gives the same bytes
         format: one or more formats of the recording; all hold the same images; by default the layout's own: ros1 for
             spot_ros1, else mcap
@@ -55,10 +57,13 @@ def synthesize(
         without: effects to switch off: lens, exposure, vignetting, noise, blur, jpeg, depth_noise, depth_holes
         lens: distortion of the arm's camera; by default that of its sensor
         changes: what changes between the mapping walk and the robot's visit: standard, none, or a TOML file like a
-            session's changes.toml
+            session's changes.toml; a mesh does not change
+        unit: unit of a mesh; by default it has to look like metres
+        up: axis of a mesh that points up; by default it has to look like z
         force: replace an existing folder
     """
     from sim_bridge.errors import SynthesisError
+    from sim_bridge.importing import MeshOptions
     from sim_bridge.recording.recorder import own_format
     from sim_bridge.scenes.changes import find_changes
     from sim_bridge.sensors import load_sensors, with_lens, with_quality
@@ -85,6 +90,7 @@ def synthesize(
         recorder=dataclasses.replace(standard.recorder, layout=layout),
         sensors=chosen,
         changes=find_changes(changes),
+        mesh=MeshOptions(up=up, unit=unit),
     )
     begin = time.monotonic()
     write_session(scene, out, seed=seed, formats=format or (own_format(layout),), options=options, force=force)

@@ -25,11 +25,12 @@ from fieldkit.store import (
 from fieldkit.store.files import refuse_existing
 from fieldkit.types import TagMap, TagPose
 from sim_bridge.errors import SynthesisError
+from sim_bridge.importing import MeshOptions, import_scene, is_mesh
 from sim_bridge.mapping import mapper, photographer
 from sim_bridge.mesh import Scene
 from sim_bridge.recording import recorder, schedule
 from sim_bridge.scenes import make_blueprint
-from sim_bridge.scenes.changes import STANDARD_CHANGES, ChangeOptions, make_worlds, write_changes
+from sim_bridge.scenes.changes import STANDARD_CHANGES, ChangeOptions, Worlds, make_worlds, write_changes
 from sim_bridge.sensors import STANDARD, Sensors, write_sensors
 from sim_bridge.stage import staging
 
@@ -45,6 +46,7 @@ class SessionOptions:
     recorder: recorder.RecorderOptions = dataclasses.field(default_factory=recorder.RecorderOptions)
     sensors: Sensors = STANDARD
     changes: ChangeOptions | None = STANDARD_CHANGES
+    mesh: MeshOptions = dataclasses.field(default_factory=MeshOptions)
 
 
 def synthesize(
@@ -58,9 +60,11 @@ def synthesize(
 ) -> None:
     """Write a session folder; the same scene, seed and options give the same bytes.
 
+    ``scene`` is the name of a scene or the path of a mesh; nothing changes in a mesh between mapping and visit.
+
     The recordings of all formats hold the same images, bit for bit. Raises SynthesisError for an unknown scene,
-    format or layout, or a scene without room for the session, and StoreError when the folder exists and ``force`` is
-    not set.
+    format or layout, a mesh that is no building, or a scene without room for the session, and StoreError when the
+    folder exists and ``force`` is not set.
     """
     chosen, out = options or SessionOptions(), Path(out)
     for wanted in formats or ("none",):
@@ -70,13 +74,15 @@ def synthesize(
     if seed < 0:
         raise SynthesisError(f"seed {seed}; expected 0 or more", hint="choose another seed")
     refuse_existing(out, force=force, marker="session.toml", kind="folder")
-    worlds = make_worlds(make_blueprint(scene, seed), chosen.changes, seed=seed)
+    imported = is_mesh(scene)
+    changes = None if imported else chosen.changes
+    worlds = _imported(scene, chosen) if imported else make_worlds(make_blueprint(scene, seed), changes, seed=seed)
     # Tags, tripods and the robot's ways have to fit the world that is photographed and the one that is visited.
     stage = staging.set_stage(worlds.both, chosen.stage, rng=generator(seed, 4))
     before, after = (staging.set_in(world, stage) for world in (worlds.mapped, worlds.visited))
     with atomic_folder(out, force=force, marker="session.toml") as folder:
         write_sensors(folder / "sensors.toml", chosen.sensors)
-        write_changes(folder, chosen.changes, worlds)
+        write_changes(folder, changes, worlds)
         _write_mapping(folder, worlds.mapped, chosen, seed=seed)
         _write_photos(folder, before, chosen, seed=seed)
         _write_robot(folder, after, chosen, formats, seed=seed)
@@ -84,7 +90,14 @@ def synthesize(
         _write_tags(folder / "truth" / "tags.toml", stage)
         recording = recorder.RECORDINGS[formats[0]]
         layout = chosen.recorder.layout
-        write_session(folder / "session.toml", SessionFile(f"{scene}-{seed}", recording, layout=layout))
+        name = Path(scene).stem if imported else scene
+        write_session(folder / "session.toml", SessionFile(f"{name}-{seed}", recording, layout=layout))
+
+
+def _imported(path: str, options: SessionOptions) -> Worlds:
+    """Return a mesh as all three worlds: nobody has said what in it can move, so nothing changes."""
+    scene = import_scene(Path(path), options.mesh)
+    return Worlds(scene, scene, scene)
 
 
 def generator(seed: int, part: int) -> np.random.Generator:
