@@ -76,7 +76,7 @@ def synthesize(
     refuse_existing(out, force=force, marker="session.toml", kind="folder")
     imported = is_mesh(scene)
     changes = None if imported else chosen.changes
-    worlds = _imported(scene, chosen) if imported else make_worlds(make_blueprint(scene, seed), changes, seed=seed)
+    worlds = _imported(scene, chosen.mesh) if imported else make_worlds(make_blueprint(scene, seed), changes, seed=seed)
     # Tags, tripods and the robot's ways have to fit the world that is photographed and the one that is visited.
     stage = staging.set_stage(worlds.both, chosen.stage, rng=generator(seed, 4))
     before, after = (staging.set_in(world, stage) for world in (worlds.mapped, worlds.visited))
@@ -94,9 +94,9 @@ def synthesize(
         write_session(folder / "session.toml", SessionFile(f"{name}-{seed}", recording, layout=layout))
 
 
-def _imported(path: str, options: SessionOptions) -> Worlds:
+def _imported(path: str, options: MeshOptions) -> Worlds:
     """Return a mesh as all three worlds: nobody has said what in it can move, so nothing changes."""
-    scene = import_scene(Path(path), options.mesh)
+    scene = import_scene(Path(path), options)
     return Worlds(scene, scene, scene)
 
 
