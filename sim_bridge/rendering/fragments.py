@@ -18,7 +18,7 @@ Longs = NDArray[np.int64]
 # A tile's samples lie in memory by row, then by chunk of 8 pixels, then by sample, then by pixel of the chunk.
 CHUNK = 8
 # A fragment is at most so many pixels long: one filter serves it.
-LONGEST = 8
+LONGEST = 16
 # Texels, and levels of light, by which one triangle may stand for another.
 _TEXELS, _LIGHT = 1.0 / 32.0, 1.0 / 512.0
 

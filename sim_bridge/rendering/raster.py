@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sim_bridge.rendering.cull import TILE_H, TILE_W, Mesh, Set, View, set_up
 from sim_bridge.rendering.fragments import CHUNK
 from sim_bridge.rendering.kernels import inlined, inner, kernel, parallel_kernel
-from sim_bridge.rendering.shade import DX, DY, Picture, Textures, resolve
+from sim_bridge.rendering.shade import DX, DY, Picture, Textures, new_scratch, resolve
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -176,11 +176,11 @@ def _band(
     tile = _new_tile(5 if samples > 1 else 1)
     places = np.full((bins.cluster.shape[0] + 1, 2), -1, np.int64)
     places[-1, 0] = offset
-    room = np.empty((4 * TILE_W * TILE_H, 5), np.int32)
+    scratch = new_scratch()
     for number in range(first, stop):
         area = ((number % across) * TILE_W, (number // across) * TILE_H)
         _fill(number, area, mesh, view, bins, out, places, tile)
-        resolve(area[0], area[1], mesh, textures, out, tile.w, tile.owner, samples, room, picture)
+        resolve(area[0], area[1], mesh, textures, out, tile.w, tile.owner, samples, scratch, picture)
 
 
 @parallel_kernel

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.rendering.cull import TILE_H, TILE_W, Mesh, Set
-from sim_bridge.rendering.fragments import CHUNK, Tile, list_fragments, place
-from sim_bridge.rendering.kernels import inlined, inner
+from sim_bridge.rendering.fragments import CHUNK, LONGEST, Tile, list_fragments, place
+from sim_bridge.rendering.kernels import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -60,6 +60,17 @@ class Picture(NamedTuple):
     seen: Ints
 
 
+class Scratch(NamedTuple):
+    """Room for the fragments of a tile i32[4*pixels,5], and for the pixels of one: packed colours i64[LONGEST], and
+    texture coordinates and light f64[LONGEST]."""
+
+    fragments: Ints
+    total: Longs
+    u: Floats
+    v: Floats
+    light: Floats
+
+
 class Filter(NamedTuple):
     """How a texture is filtered: taps, the finer mip level (the next is the coarser), the whole-number weights of one
     tap in both, and the step from tap to tap in texture coordinates."""
@@ -98,7 +109,8 @@ def _filter(levels: Longs, texture: int, j: tuple[float, float, float, float]) -
     up to MAX_TAPS taps along the longer axis of the footprint."""
     width, height = levels[texture, 0, 1], levels[texture, 0, 2]
     long, short, dx, dy = _footprint(j[0] * width, j[1] * height, j[2] * width, j[3] * height)
-    taps = MAX_TAPS if long > MAX_TAPS * short else max(1, int(long / short + _TAP_ROUNDING))
+    # A face whose corners share one place of the texture has no footprint at all.
+    taps = MAX_TAPS if long > MAX_TAPS * short else max(1, int(long / max(short, 1e-300) + _TAP_ROUNDING))
     level, size = 0, LOD_FACTOR * long / taps
     while size >= 2.0 and level < levels.shape[1] - 1:
         size *= 0.5
@@ -133,77 +145,114 @@ def _spread(texel: np.uint32) -> np.int64:
     return (wide | wide << 32) & _SPREAD
 
 
-@inlined
-def _sample(texels: Words, levels: Longs, texture: int, how: Filter, u: float, v: float) -> int:
-    """Filter a texture at (u, v) in 0..1: packed colours times taps * (how.near + how.far)."""
-    first = 0.5 * (1 - how.taps)
-    s, t = u + first * how.step_u, v + first * how.step_v
-    total = 0
+@inner
+def _sample(texels: Words, levels: Longs, texture: int, how: Filter, count: int, scratch: Scratch) -> None:
+    """Filter a texture at scratch.u, scratch.v in 0..1: packed colours times how.taps * (how.near + how.far)."""
+    u, v, total = scratch.u, scratch.v, scratch.total
+    total[:count] = 0
     level, weight = how.level, how.near
     for _ in range(2):
         if weight > 0:
             start, width, height = levels[texture, level, 0], levels[texture, level, 1], levels[texture, level, 2]
-            x, y = int(_ONE * (s * width) - _HALF), int(_ONE * (t * height) - _HALF)
-            dx, dy = int(_ONE * (how.step_u * width)), int(_ONE * (how.step_v * height))
-            for _ in range(how.taps):
-                total += _bilinear(texels, start, width, height, x, y, weight)
-                x, y = x + dx, y + dy
+            wide, high = _ONE * width, _ONE * height
+            for k in range(how.taps):
+                along = k + 0.5 - 0.5 * how.taps
+                dx, dy = along * how.step_u * wide - _HALF, along * how.step_v * high - _HALF
+                for i in range(count):
+                    x, y = int(u[i] * wide + dx), int(v[i] * high + dy)
+                    total[i] += _bilinear(texels, start, width, height, x, y, weight)
         level, weight = level + 1, how.far
-    return total
 
 
 @inner
-def _colour(fragments: Ints, tile: Tile, out: Set, textures: Textures, rgb: Bytes) -> None:
+def _surface(
+    k: int, length: int, x0: float, y: float, share: float, out: Set, textures: Textures, scratch: Scratch
+) -> None:
+    """Fill scratch.total and scratch.light for ``length`` pixels of triangle k from (x0, y) on: packed colours, and
+    what they have to be multiplied by, beside shade/z, for ``share`` of a pixel in 2 ** -32 levels."""
+    p, u, v, light = out.planes, scratch.u, scratch.v, scratch.light
+    aw, au, av = p[k, 9], p[k, 12], p[k, 15]
+    bw, bu, bv = p[k, 10], p[k, 13], p[k, 16]
+    cw, cu, cv = bw * y + p[k, 11], bu * y + p[k, 14], bv * y + p[k, 17]
+    middle = x0 + 0.5 * (length - 1)
+    z = 1.0 / (aw * middle + cw)
+    s, t = (au * middle + cu) * z, (av * middle + cv) * z
+    texture = out.texture[k]
+    how = _filter(
+        textures.levels, texture, ((au - s * aw) * z, (av - t * aw) * z, (bu - s * bw) * z, (bv - t * bw) * z)
+    )
+    unit = share * _UNIT / (how.taps * (how.near + how.far))
+    for i in range(length):
+        x = x0 + i
+        z = 1.0 / (aw * x + cw)
+        u[i], v[i], light[i] = (au * x + cu) * z, (av * x + cv) * z, unit * z
+    texels = textures.added if texture >= textures.base else textures.texels
+    _sample(texels, textures.levels, texture, how, length, scratch)
+
+
+@inlined
+def _write(pixel: Bytes, red: int, green: int, blue: int) -> None:
+    pixel[0] = np.uint8(min(255, red + _ROUND >> _BITS))
+    pixel[1] = np.uint8(min(255, green + _ROUND >> _BITS))
+    pixel[2] = np.uint8(min(255, blue + _ROUND >> _BITS))
+
+
+@inner
+def _brighten(fragment: Ints, x0: float, y: float, several: bool, tile: Tile, planes: Floats, light: Floats) -> None:
+    """Multiply what `_surface` left in ``light`` by the baked light: where the triangle of a fragment stands for
+    ``several``, by that of each pixel's own triangle."""
+    m, row, col, length = fragment[0], fragment[1], fragment[2], fragment[3]
+    for i in range(length):
+        if several:
+            m = tile.owner[place(row, col + i, tile.layers)]
+        light[i] *= max(planes[m, 18] * (x0 + i) + planes[m, 19] * y + planes[m, 20], 0.0)
+
+
+@inner
+def _colour(count: int, tile: Tile, out: Set, textures: Textures, scratch: Scratch, rgb: Bytes) -> None:
     """Colour the fragments of a tile. One filter serves a fragment, that of its middle.
 
     Shading at the mean of the samples of one surface keeps off a texture's outside.
     """
-    planes, levels, owner, samples = out.planes, textures.levels, tile.owner, tile.samples
+    samples, fragments, light, total = tile.samples, scratch.fragments, scratch.light, scratch.total
     first = 4 if samples == 1 else 0
-    red = green = blue = done = 0
-    for n in range(fragments.shape[0]):
+    everything = (1 << samples) - 1
+    red = green = blue = 0
+    missing = everything
+    for n in range(count):
         k, row, col, length = fragments[n, 0], fragments[n, 1], fragments[n, 2], fragments[n, 3]
-        count, dx, dy = 0, 0.0, 0.0
-        for s in range(samples):
-            if fragments[n, 4] >> s & 1:
-                count, dx, dy = count + 1, dx + DX[first + s], dy + DY[first + s]
-        x0, y0 = tile.x + col + 0.5 + dx / count, tile.y + row + 0.5 + dy / count
-        texels, texture, how, unit = textures.texels, 0, Filter(1, 0, 0, 0, 0.0, 0.0), 0.0
-        aw = au = av = cw = cu = cv = 0.0
+        mask, parts, dx, dy = fragments[n, 4] & everything, samples, 0.0, 0.0
+        if mask != everything:
+            parts = 0
+            for s in range(samples):
+                if mask >> s & 1:
+                    parts, dx, dy = parts + 1, dx + DX[first + s], dy + DY[first + s]
+        x, y = tile.x + col + 0.5 + dx / parts, tile.y + row + 0.5 + dy / parts
+        share = parts / samples
         if k >= 0:
-            texture = out.texture[k]
-            aw, au, av = planes[k, 9], planes[k, 12], planes[k, 15]
-            bw, bu, bv = planes[k, 10], planes[k, 13], planes[k, 16]
-            cw, cu, cv = bw * y0 + planes[k, 11], bu * y0 + planes[k, 14], bv * y0 + planes[k, 17]
-            middle = x0 + 0.5 * (length - 1)
-            z = 1.0 / (aw * middle + cw)
-            u, v = (au * middle + cu) * z, (av * middle + cv) * z
-            j = ((au - u * aw) * z, (av - v * aw) * z, (bu - u * bw) * z, (bv - v * bw) * z)
-            how = _filter(levels, texture, j)
-            texels = textures.added if texture >= textures.base else textures.texels
-            unit = _UNIT * count / (samples * how.taps * (how.near + how.far))
+            _surface(k, length, x, y, share, out, textures, scratch)
+            _brighten(fragments[n], x, y, fragments[n, 4] > everything, tile, out.planes, light)
+        missing &= ~mask
         for i in range(length):
             if k >= 0:
-                x = x0 + i
-                z = 1.0 / (aw * x + cw)
-                packed = _sample(texels, levels, texture, how, (au * x + cu) * z, (av * x + cv) * z)
-                # The light is that of the pixel's own triangle, not of the one that stands for it.
-                m = k if length == 1 else owner[place(row, col + i, tile.layers)]
-                bright = planes[m, 18] * x + planes[m, 19] * y0 + planes[m, 20]
-                light = int(unit * (bright * z))
-                red, green = red + light * (packed & _LANE), green + light * (packed >> 21 & _LANE)
-                blue += light * (packed >> 42)
+                packed, bright = total[i], int(light[i])
+                red, green = red + bright * (packed & _LANE), green + bright * (packed >> 21 & _LANE)
+                blue += bright * (packed >> 42)
             else:
-                part = _UNIT * count / samples
-                red += int(part * textures.background[0])
-                green += int(part * textures.background[1])
-                blue += int(part * textures.background[2])
-            done += count
-            if done == samples:
-                rgb[tile.y + row, tile.x + col + i, 0] = np.uint8(min(255, red + _ROUND >> _BITS))
-                rgb[tile.y + row, tile.x + col + i, 1] = np.uint8(min(255, green + _ROUND >> _BITS))
-                rgb[tile.y + row, tile.x + col + i, 2] = np.uint8(min(255, blue + _ROUND >> _BITS))
-                red = green = blue = done = 0
+                red += int(share * _UNIT * textures.background[0])
+                green += int(share * _UNIT * textures.background[1])
+                blue += int(share * _UNIT * textures.background[2])
+            if missing == 0:
+                _write(rgb[tile.y + row, tile.x + col + i], red, green, blue)
+                red = green = blue = 0
+        missing = everything if missing == 0 else missing
+
+
+@kernel
+def new_scratch() -> Scratch:
+    """Make the room that `resolve` needs."""
+    fragments = np.empty((4 * TILE_W * TILE_H, 5), np.int32)
+    return Scratch(fragments, np.empty(LONGEST, np.int64), np.empty(LONGEST), np.empty(LONGEST), np.empty(LONGEST))
 
 
 @inner
@@ -216,17 +265,21 @@ def resolve(
     w: Floats,
     owner: Ints,
     samples: int,
-    room: Ints,
+    scratch: Scratch,
     picture: Picture,
 ) -> None:
-    """Turn the visibility buffer of the tile at pixel (x, y) into colour and depth; room i32[4*pixels,5] is scratch."""
+    """Turn the visibility buffer of the tile at pixel (x, y) into colour and depth."""
     height, width = picture.depth.shape
     layers = 5 if samples > 1 else 1
     tile = Tile(owner, samples, layers, x, y, min(TILE_H, height - y), min(TILE_W, width - x))
     for row in range(tile.rows):
-        for col in range(tile.cols):
-            at = place(row, col, layers) + (layers - 1) * CHUNK
-            picture.depth[y + row, x + col] = 1.0 / w[at] if w[at] > 0.0 else 0.0
-            picture.seen[y + row, x + col] = owner[at]
-    n = list_fragments(tile, mesh, textures.levels, out, room)
-    _colour(room[:n], tile, out, textures, picture.rgb)
+        for col in range(0, tile.cols, CHUNK):
+            at, length = place(row, col, layers) + (layers - 1) * CHUNK, min(CHUNK, tile.cols - col)
+            near, owners = w[at : at + length], owner[at : at + length]
+            depth = picture.depth[y + row, x + col : x + col + length]
+            seen = picture.seen[y + row, x + col : x + col + length]
+            for i in range(length):
+                depth[i] = 1.0 / near[i] if near[i] > 0.0 else 0.0
+                seen[i] = owners[i]
+    count = list_fragments(tile, mesh, textures.levels, out, scratch.fragments)
+    _colour(count, tile, out, textures, scratch, picture.rgb)
