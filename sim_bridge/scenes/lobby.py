@@ -15,8 +15,10 @@ The plan, in metres, with x to the east (0..12.4) and y to the north (0..9):
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,12 +29,13 @@ from sim_bridge.scenes import lobby_prints as prints
 from sim_bridge.scenes import office_prints, textures
 from sim_bridge.scenes.blueprint import Blueprint, Builder
 from sim_bridge.scenes.lobby_furniture import Make
-from sim_bridge.scenes.office_furniture import hang, moved, plant, px
+from sim_bridge.scenes.office_furniture import gallery, hang, moved, plant, px
 from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_frame, window
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 12.4, 9.0, 3.9
 WAITING_X, GATES_Y = 4.4, 6.3
 _PX_PER_M, _FLOOR_PX_PER_M = 110, 130
+_HUNG_SHARE = 0.6
 _WINDOW_POWER, _LAMP_POWER, _SPOT_POWER = 9.0, 2.6, 1.2
 
 Line = tuple[tuple[float, float], tuple[float, float]]
@@ -44,6 +47,19 @@ _WEST = ((0.0, WIDTH_M), (0.0, 0.0))
 _WAITING_SOUTH = ((0.0, GATES_Y), (WAITING_X, GATES_Y))
 _WAITING_EAST = ((WAITING_X, GATES_Y), (WAITING_X, WIDTH_M))
 _PILLARS = ((3.3, 3.1), (8.3, 3.6), (5.45, GATES_Y))
+
+
+# Stretches of walls (from, to in m from their start) on which prints hang, and how high.
+_GALLERIES: tuple[tuple[Line, Literal["left", "right"], float, tuple[tuple[float, float], ...]], ...] = (
+    (_SOUTH, "left", 1.5, ((0.2, 1.4), (2.4, 3.25), (9.4, 11.6))),
+    (_EAST, "left", 1.65, ((0.9, 3.6), (7.1, 8.8))),
+    (_NORTH, "left", 1.75, ((2.8, 3.2), (4.75, 5.2), (9.3, 10.0))),
+    (_WEST, "left", 1.5, ((2.9, 4.2), (6.6, 8.7))),
+    (_WAITING_EAST, "left", 1.5, ((0.2, 1.9),)),
+    (_WAITING_EAST, "right", 1.5, ((0.3, 2.5),)),
+    (_WAITING_SOUTH, "left", 1.5, ((1.0, 2.5),)),
+    (_WAITING_SOUTH, "right", 1.5, ((0.3, 2.5),)),
+)
 
 
 def lobby(seed: int) -> Blueprint:
@@ -59,6 +75,7 @@ def lobby(seed: int) -> Blueprint:
     _seats(build, rng, look)
     _boards(build, rng, look)
     _waiting_room(build, rng, look)
+    _galleries(build, rng)
     bounds = (0.0, 0.0, LENGTH_M, WIDTH_M)
     outside(build, bounds, [bounds])
     return build.blueprint(floor_bounds=bounds)
@@ -147,8 +164,6 @@ def _reception(build: Builder, rng: np.random.Generator, look: Make) -> None:
     size = (2.2, 0.6)
     image = prints.logo(rng, px(size, px_per_m=250), base=(226, 223, 216))
     _hang(build, _WEST, WIDTH_M - 3.6, size, image, up_m=2.1, name="logo")
-    for y, size in ((5.6, (0.6, 0.84)), (1.3, (0.8, 1.1))):
-        _hang(build, _WEST, WIDTH_M - y, size, _picture(rng, size), up_m=1.5)
 
 
 def _gates_and_lifts(build: Builder, rng: np.random.Generator, look: Make) -> None:
@@ -161,14 +176,6 @@ def _gates_and_lifts(build: Builder, rng: np.random.Generator, look: Make) -> No
         furniture.lift(build, look, wall_frame(*_NORTH, LENGTH_M - x))
     size = (0.8, 1.1)
     _hang(build, _NORTH, LENGTH_M - 11.75, size, prints.directory(rng, px(size)), up_m=1.55, name="directory")
-    for x in (7.4, 9.4):
-        size = (0.45, 0.64)
-        _hang(build, _NORTH, LENGTH_M - x, size, _picture(rng, size), up_m=1.85)
-    size = (0.8, 1.1)
-    back = wall_frame(*_WAITING_EAST, 1.5, side="right")
-    hang(build, on_wall(back, 0.0, 1.45, off_m=0.0), size, textures.chart(rng, px(size)))
-    size = (0.9, 0.65)
-    _hang(build, _EAST, 7.9, size, _picture(rng, size), up_m=1.6)
 
 
 def _seats(build: Builder, rng: np.random.Generator, look: Make) -> None:
@@ -197,20 +204,14 @@ def _boards(build: Builder, rng: np.random.Generator, look: Make) -> None:
     furniture.kiosk(build, rng, look, yaw_pose([4.3, 5.95, 0.0], np.pi))
     size = (1.9, 1.3)
     _hang(build, _EAST, 4.9, size, prints.painting(rng, px(size, px_per_m=300)), up_m=1.75, name="painting")
-    size = (0.7, 0.95)
-    _hang(build, _SOUTH, 10.4, size, textures.photo(rng, px(size)), up_m=1.5)
-    for at in (1.3, 2.6):
-        size = (0.6, 0.84)
-        _hang(build, _EAST, at, size, _picture(rng, size), up_m=1.65)
     for x, y, yaw in ((5.3, 5.0, 0.2), (9.6, 5.1, -0.3), (7.0, 2.1, 1.4), (3.0, 2.0, 1.9), (8.4, 7.9, 1.57)):
         furniture.banner(build, rng, look, yaw_pose([x, y, 0.0], yaw), ceiling_m=HEIGHT_M)
-    size = (0.6, 0.84)
-    hang(
-        build,
-        on_wall(wall_frame(*_WAITING_SOUTH, 1.2, side="right"), 0.0, 1.5, off_m=0.0),
-        size,
-        textures.page(rng, px(size)),
-    )
+
+
+def _galleries(build: Builder, rng: np.random.Generator) -> None:
+    """Hang prints along some stretches of the walls; the rest stays blank or striped."""
+    for line, side, up, spans in _GALLERIES:
+        gallery(build, rng, functools.partial(wall_frame, *line, side=side), spans, share=_HUNG_SHARE, up_m=up)
 
 
 def _waiting_room(build: Builder, rng: np.random.Generator, look: Make) -> None:
@@ -219,8 +220,4 @@ def _waiting_room(build: Builder, rng: np.random.Generator, look: Make) -> None:
         furniture.armchair(build, look, yaw_pose([0.48, y, 0.0], np.pi / 2 + float(rng.normal(0, 0.1))))
     size = (1.1, 0.75)
     _hang(build, _WEST, WIDTH_M - 7.4, size, office_prints.cork(rng, px(size)), up_m=1.5, name="notices")
-    size = (0.75, 1.0)
-    _hang(build, _WAITING_EAST, 1.2, size, office_prints.emblem(rng, px(size)), up_m=1.5)
-    size = (0.6, 0.84)
-    _hang(build, _WAITING_SOUTH, 1.5, size, _picture(rng, size), up_m=1.5)
     furniture.kiosk(build, rng, look, yaw_pose([3.4, 8.5, 0.0], np.pi + 0.2))

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,6 +36,8 @@ LENGTH_M, WIDTH_M, HEIGHT_M = 14.9, 11.0, 2.7
 KITCHEN_X, CORRIDOR_Y, ROOMS_Y = 11.4, 6.2, 7.7
 _PX_PER_M, _FLOOR_PX_PER_M = 110, 120
 _DOWN = Rotation.from_euler("x", np.pi)
+# The share of a stretch of wall that prints cover.
+_HUNG_SHARE = 0.62
 _WINDOW_POWER, _LAMP_POWER = 3.0, 4.2
 
 
@@ -87,6 +90,7 @@ def office(seed: int) -> Blueprint:
     _ceilings(build, rng)
     _open_plan(build, rng, look)
     _corridor(build, rng, look)
+    _galleries(build, rng)
     for i, room in enumerate(rng.permutation(2)):
         _single_office(build, rng, look, x0=_ROOM_XS[i], variant=int(room))
     _meeting_room(build, rng, look)
@@ -184,12 +188,27 @@ def _picture(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
     return prints.printed(rng, px(size_m))
 
 
-def _poster(build: Builder, rng: np.random.Generator, place: Pose, *, large: float = 1.0) -> None:
-    """Hang a poster on a wall's frame, at eye height or a little lower."""
-    width = large * float(rng.uniform(0.65, 0.95))
-    size = (width, width * float(rng.uniform(1.0, 1.4)))
-    at = on_wall(place, 0.0, float(rng.uniform(1.35, 1.55)), off_m=0.0)
-    hang(build, at, size, _picture(rng, size))
+def _galleries(build: Builder, rng: np.random.Generator) -> None:
+    """Hang prints along the walls wherever no furniture, board or opening is in the way; some walls stay blank."""
+    d1, d2 = (Line((x, ROOMS_Y), (x, WIDTH_M)) for x in _ROOM_XS[1:3])
+    faces: tuple[tuple[Callable[[float], Pose], float, tuple[tuple[float, float], ...]], ...] = (
+        (SOUTH.left, 1.5, ((3.25, 4.7), (6.7, 8.15), (10.15, 11.0), (11.6, 12.6))),
+        (WEST.left, 1.55, ((0.55, 3.1), (5.0, 7.2), (9.0, 10.4))),
+        (KITCHEN.left, 1.5, ((2.0, 4.6),)),
+        (KITCHEN.right, 1.5, ((0.4, 3.2),)),
+        (FRONT.left, 1.45, ((0.2, 1.3), (2.9, 8.5), (10.1, 11.65), (13.15, 14.7))),
+        (FRONT.right, 1.5, ((7.8, 8.5), (10.1, 11.2), (13.1, 14.7))),
+        (BACK.right, 1.45, ((2.12, 2.7), (5.8, 6.85), (8.5, 9.3), (10.95, 12.5), (13.7, 14.7))),
+        (BACK.left, 1.45, ((1.95, 4.1), (4.7, 7.1), (10.8, 14.4))),
+        (NORTH.left, 1.5, ((0.3, 1.9), (4.1, 5.8))),
+        (EAST.left, 1.5, ((4.7, 6.0), (6.4, 7.5), (7.85, 8.5), (10.2, 10.8))),
+        (d1.left, 1.55, ((0.2, 2.9),)),
+        (d1.right, 1.55, ((0.2, 2.9),)),
+        (d2.left, 1.65, ((0.2, 2.4),)),
+        (d2.right, 1.5, ((2.6, 3.1),)),
+    )
+    for face, up, spans in faces:
+        furniture.gallery(build, rng, face, spans, share=_HUNG_SHARE, up_m=up)
 
 
 def _board(build: Builder, rng: np.random.Generator, place: Pose, *, width_m: float, up_m: float = 1.5) -> None:
@@ -221,11 +240,6 @@ def _open_plan(build: Builder, rng: np.random.Generator, look: Style) -> None:
     size = (1.6, 1.0)
     board = on_wall(WEST.left(WIDTH_M - 2.9), 0.0, 1.45, off_m=0.0)
     hang(build, board, size, prints.whiteboard(rng, px(size)), name="board")
-    for at in (WIDTH_M - 0.9, WIDTH_M - 4.6):
-        _poster(build, rng, WEST.left(at), large=1.1)
-    for x in (3.95, 7.4):
-        _poster(build, rng, SOUTH.left(x), large=1.2)
-    _poster(build, rng, KITCHEN.left(2.9), large=1.4)
     size = (1.1, 0.62)
     image = textures.screen(rng, px(size))
     hang(build, on_wall(KITCHEN.left(1.3), 0.0, 1.5, off_m=0.03), size, image, name="television")
@@ -245,12 +259,7 @@ def _corridor(build: Builder, rng: np.random.Generator, look: Style) -> None:
         text = f"{int(rng.integers(1, 4))}.{i + 11}"
         image = prints.sign(rng, px(size), text=text, base=(70, 78, 90))
         hang(build, on_wall(BACK.right(x), 0.0, 1.55, off_m=0.0), size, image, name="sign")
-    for x in (2.5, 6.3, 11.7):
-        _poster(build, rng, BACK.right(x + float(rng.uniform(-0.1, 0.1))))
-    for x in (0.8, 4.1, 7.2, 11.0, 13.8):
-        _poster(build, rng, FRONT.left(x + float(rng.uniform(-0.2, 0.2))), large=float(rng.choice([1.0, 1.3])))
     _board(build, rng, WEST.left(WIDTH_M - 6.95), width_m=1.2)
-    _poster(build, rng, EAST.left(6.95), large=1.3)
     for x in (3.2, 8.6):
         furniture.hanging_sign(build, rng, yaw_pose([x, 6.95, 0.0], np.pi / 2), ceiling_m=HEIGHT_M)
 
@@ -267,14 +276,9 @@ def _single_office(build: Builder, rng: np.random.Generator, look: Style, *, x0:
     furniture.bookcase(build, rng, look, NORTH.left(LENGTH_M - (x0 + 0.6)))
     furniture.cupboard(build, look, NORTH.left(LENGTH_M - (x1 - 0.6)))
     furniture.cupboard(build, look, outer, height_m=1.1)
-    _poster(build, rng, moved(outer, float(rng.uniform(-0.2, 0.2))), large=1.1)
-    _poster(build, rng, BACK.left(x0 + 2.9))
     if variant == 0:
-        size = (1.2, 0.8)
-        hang(build, on_wall(inner, 0.2, 1.55, off_m=0.0), size, prints.whiteboard(rng, px(size)), name="board")
         furniture.carton(build, rng, corner * yaw_pose([0.0, 0.0, 0.0], 0.2), height_m=0.35)
     else:
-        _poster(build, rng, moved(inner, 0.4))
         furniture.plant(build, rng, corner)
 
 
@@ -293,8 +297,6 @@ def _meeting_room(build: Builder, rng: np.random.Generator, look: Style) -> None
     size = (1.8, 1.1)
     divider = Line((8.8, ROOMS_Y), (8.8, WIDTH_M))
     hang(build, on_wall(divider.right(1.6), 0.0, 1.45, off_m=0.0), size, prints.whiteboard(rng, px(size)), name="board")
-    for x in (11.4, 12.6, 13.9):
-        _poster(build, rng, BACK.left(x), large=1.1)
 
 
 def _kitchenette(build: Builder, rng: np.random.Generator, look: Style) -> None:
@@ -308,7 +310,5 @@ def _kitchenette(build: Builder, rng: np.random.Generator, look: Style) -> None:
             if rng.random() < 0.8:
                 furniture.seat(build, look, moved(near, yaw_rad=float(rng.normal(0, 0.2))))
     _board(build, rng, KITCHEN.right(3.9), width_m=1.1)
-    _poster(build, rng, KITCHEN.right(1.6), large=1.2)
-    _poster(build, rng, SOUTH.left(12.2))
     size = (0.45, 0.7)
     hang(build, on_wall(FRONT.right(13.6), 0.0, 1.5, off_m=0.0), size, prints.calendar(rng, px(size)), name="calendar")

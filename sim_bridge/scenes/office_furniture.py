@@ -6,6 +6,7 @@ All desks, chairs, screens and cupboards of a scene are of one make: they share 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -75,6 +76,43 @@ def hang(
         build.box(at, [0.0, 0.0, 0.008], [size_m[0] + 0.024, size_m[1] + 0.024, 0.014], rim, solid=False)
         front = at * Pose.from_components([0.0, 0.0, 0.0165], Rotation.identity())
         build.panel(front, size_m, texture, solid=False)
+
+
+def gallery(
+    build: Builder,
+    rng: np.random.Generator,
+    face: Callable[[float], Pose],
+    spans: Sequence[tuple[float, float]],
+    *,
+    share: float,
+    up_m: float = 1.5,
+) -> None:
+    """Hang prints side by side on stretches of a wall, so that they cover a share of its length.
+
+    ``face`` gives the wall's frame at a distance from its start; the prints' middles are about ``up_m`` high, and
+    some have a smaller one below.
+    """
+    for start, stop in spans:
+        at = start + float(rng.uniform(0.0, 0.3))
+        while True:
+            width = float(rng.uniform(0.5, 1.0))
+            width = min(width, stop - at - 0.06)
+            if width < 0.3:
+                break
+            height = min(width * float(rng.uniform(0.8, 1.4)), 1.15)
+            middle = up_m + float(rng.uniform(-0.08, 0.1))
+            place = face(at + width / 2)
+            hang(build, on_wall(place, 0.0, middle, off_m=0.0), (width, height), _print(rng, (width, height)))
+            below = middle - height / 2 - 0.08
+            if rng.random() < 0.35 and below > 0.75:
+                small = (min(width, 0.55), min(0.42, below - 0.4))
+                low = on_wall(place, 0.0, below - small[1] / 2, off_m=0.0)
+                hang(build, low, small, _print(rng, small))
+            at += width + max(0.08, width * (1.0 - share) / share * float(rng.uniform(0.4, 1.6)))
+
+
+def _print(rng: np.random.Generator, size_m: tuple[float, float]) -> Rgb:
+    return office_prints.printed(rng, px(size_m))
 
 
 def px(size_m: tuple[float, float], *, px_per_m: float = _PRINT_PX_PER_M) -> tuple[int, int]:

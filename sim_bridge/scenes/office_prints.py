@@ -35,15 +35,15 @@ def carpet(rng: np.random.Generator, size: Size, *, base: ArrayLike, px_per_m: f
     rows, cols = (np.arange(n) // (0.5 * px_per_m) % 2 for n in size)
     image = 2.0 * fractal(rng, size, cell_px=3, octaves=1) + 4.0 * fractal(rng, size, cell_px=0.6 * px_per_m, octaves=5)
     image += 2.5 * np.where(rows[:, None] == cols[None], 1.0, -1.0).astype(np.float32)
-    return flecked(rng, tinted(base, image), count=int(22 * height * width / px_per_m**2), px_per_m=px_per_m)
+    return flecked(rng, tinted(base, image), count=int(20 * height * width / px_per_m**2), px_per_m=px_per_m)
 
 
 def flecked(rng: np.random.Generator, image: Rgb, *, count: int, px_per_m: float, contrast: float = 22.0) -> Rgb:
-    """Strew flecks of 1 to 5 cm over an image, a little lighter or darker than the ground."""
+    """Strew flecks of 2 to 7 cm over an image, a little lighter or darker than the ground."""
     height, width = image.shape[:2]
     ground = image.reshape(-1, 3).mean(axis=0)
     for x, y in rng.uniform((0, 0), (width, height), (count, 2)):
-        axes = np.maximum(rng.uniform(0.005, 0.025, 2) * px_per_m, 1.0)
+        axes = np.maximum(rng.uniform(0.008, 0.035, 2) * px_per_m, 1.0)
         tone = np.clip(ground + rng.normal(0.0, contrast) + rng.normal(0.0, 5.0, 3), 0, 255)
         ink = [int(v) for v in tone]
         cv2.ellipse(image, ((x, y), (2 * axes[0], 2 * axes[1]), rng.uniform(0, 180)), ink, -1, cv2.LINE_AA)
@@ -53,11 +53,11 @@ def flecked(rng: np.random.Generator, image: Rgb, *, count: int, px_per_m: float
 def ceiling_tiles(rng: np.random.Generator, size: Size, *, px_per_m: float) -> Rgb:
     """Draw mineral panels of 0.6 m in a white grid."""
     height, width = size
-    image = 232 + fractal(rng, size, cell_px=2, octaves=1) * 1.5
+    image = 232 + fractal(rng, size, cell_px=2, octaves=1)
     for x in np.arange(0, width, 0.6 * px_per_m).astype(int):
-        image[:, x : x + 2] = 205
+        image[:, x : x + 2] = 220
     for y in np.arange(0, height, 0.6 * px_per_m).astype(int):
-        image[y : y + 2] = 205
+        image[y : y + 2] = 220
     return tinted((1.0, 0.0, -4.0), image)
 
 
