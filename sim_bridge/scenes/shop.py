@@ -14,6 +14,8 @@ The plan, in metres, with x to the east (0..12) and y to the north (0..10):
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from fieldkit.frames import Pose, yaw_pose
@@ -24,7 +26,6 @@ from sim_bridge.scenes.blueprint import Blueprint, Builder
 from sim_bridge.scenes.forms import moved, paint
 from sim_bridge.scenes.halls import EAST, NORTH, SOUTH, WEST, Hall, lamps, outer_walls
 from sim_bridge.scenes.plan import Opening, slab
-from sim_bridge.scenes.shop_furniture import Plan
 from sim_bridge.scenes.shop_pictures import Product
 from sim_bridge.scenes.textures import Rgb, to_bytes
 
@@ -40,11 +41,10 @@ def shop(seed: int) -> Blueprint:
     rng = np.random.default_rng([seed, 41801])
     build = Builder()
     _shell(build, rng)
-    articles = furniture.catalogue(rng, 22)
-    low = [furniture.plan(rng, articles, boards=4, tallest_m=0.3) for _ in range(4)]
-    high = [furniture.plan(rng, articles, boards=5, tallest_m=0.3) for _ in range(2)]
-    _aisles(build, rng, articles, low)
-    _walls(build, rng, articles, high)
+    articles = furniture.catalogue(rng, 150)
+    dealt = furniture.deck(rng, len(articles))
+    _aisles(build, rng, articles, dealt)
+    _walls(build, rng, articles, dealt)
     _fridges(build, rng, articles)
     _front(build, rng, articles)
     _signs(build, rng)
@@ -76,37 +76,40 @@ def _street(rng: np.random.Generator) -> Rgb:
     return to_bytes(np.broadcast_to(fade, (64, 64, 3)) + rng.normal(0, 0.5, (64, 64, 1)))
 
 
-def _aisles(build: Builder, rng: np.random.Generator, articles: list[Product], plans: list[Plan]) -> None:
-    """Add the rows of units: the same run of plans stands in several aisles."""
-    first = [plans[0], plans[0], plans[1], plans[1]]
-    second = [plans[2], plans[3], plans[2], plans[3]]
+def _aisles(build: Builder, rng: np.random.Generator, articles: list[Product], dealt: Iterator[int]) -> None:
+    """Add the rows of units, all of one make; a sign stands on one or two units of each row."""
     for i, x in enumerate(_ROWS_X):
         count = 4 if i < 3 else 2
-        sides = (first, second) if i != 1 else (second, first)
+        first, second = ([furniture.plan(rng, articles, dealt, boards=4) for _ in range(count)] for _ in range(2))
         middle = _ROW_START_M + count / 2
         at = yaw_pose([x, middle, 0.0], np.pi / 2)
-        furniture.gondola(build, rng, at, articles, (sides[0][:count], sides[1][:count]), height_m=1.5)
+        furniture.gondola(build, rng, at, articles, (first, second), height_m=1.5)
+        for unit, side in zip(rng.permutation(count)[: count // 2], (0.0, np.pi), strict=False):
+            top = moved(moved(at, float(unit) - (count - 1) / 2), yaw_rad=side)
+            furniture.header(build, rng, top, up_m=1.5)
         end = yaw_pose([x, _ROW_START_M - 0.035, 0.0], np.pi)
-        content = furniture.plan(rng, articles, boards=4, tallest_m=0.3)
+        content = furniture.plan(rng, articles, dealt, boards=4)
         furniture.endcap(build, rng, end, articles, content, height_m=1.4)
 
 
-def _walls(build: Builder, rng: np.random.Generator, articles: list[Product], plans: list[Plan]) -> None:
-    """Add the wall shelves: one plan all along the west wall but for two units, another along the east wall."""
+def _walls(build: Builder, rng: np.random.Generator, articles: list[Product], dealt: Iterator[int]) -> None:
+    """Add the shelves along the west and the east wall; a neighbouring pair of units holds the same."""
+    content = furniture.plan(rng, articles, dealt, boards=5)
     for i in range(6):
-        at = _HALL.on(WEST, 1.6 + i)
-        furniture.shelf_unit(build, rng, at, articles, plans[0] if i != 3 else plans[1], height_m=2.0)
+        if i != 3:
+            content = furniture.plan(rng, articles, dealt, boards=5)
+        furniture.shelf_unit(build, rng, _HALL.on(WEST, 1.6 + i), articles, content, height_m=2.0)
     for i in range(3):
-        at = _HALL.on(EAST, 4.2 + i)
-        furniture.shelf_unit(build, rng, at, articles, plans[1], height_m=2.0)
+        content = furniture.plan(rng, articles, dealt, boards=5)
+        furniture.shelf_unit(build, rng, _HALL.on(EAST, 4.2 + i), articles, content, height_m=2.0)
 
 
 def _fridges(build: Builder, rng: np.random.Generator, articles: list[Product]) -> None:
     cold = articles[::3]
-    doors = [build.texture(pictures.fridge_door(rng, (0.75, 1.64), cold)) for _ in range(2)]
+    doors = [build.texture(pictures.fridge_door(rng, (0.75, 1.64), cold)) for _ in range(8)]
     for i in range(3):
         at = _HALL.on(NORTH, _HALL.length_m - 2.0 - 2.3 * i)
-        furniture.fridge(build, at, [doors[0], doors[1], doors[0]])
+        furniture.fridge(build, at, doors[3 * i : 3 * i + 3] if i < 2 else [*doors[6:], doors[7]])
     white = build.texture(pictures.cold_panel((2.1, 2.6)))
     store = yaw_pose([_HALL.length_m - 1.06, _HALL.width_m - 1.21, 0.0], 0.0)
     with build.thing("cold store", store, kind="fixed"):

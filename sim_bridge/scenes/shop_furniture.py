@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class Facing:
     count: int
 
 
-# What stands on each board of a shelf unit, lowest first: units of one plan look the same.
+# What stands on each board of a shelf unit, lowest first.
 Plan = tuple[tuple[Facing, ...], ...]
 
 
@@ -39,17 +40,25 @@ def catalogue(rng: np.random.Generator, count: int) -> list[Product]:
     return [pictures.product(rng, _SIZES[int(rng.integers(len(_SIZES)))]) for _ in range(count)]
 
 
-def plan(rng: np.random.Generator, articles: list[Product], *, boards: int, tallest_m: float) -> Plan:
-    """Draw what stands on the boards of a unit: two to four articles on each, side by side."""
-    fitting = [i for i, a in enumerate(articles) if a.size_m[1] <= tallest_m]
+def deck(rng: np.random.Generator, count: int) -> Iterator[int]:
+    """Deal articles by number without end: each once before any comes again, so that few stand in many places.
+
+    Structure from motion would fold aisles together whose units are alike.
+    """
+    while True:
+        yield from (int(i) for i in rng.permutation(count))
+
+
+def plan(rng: np.random.Generator, articles: list[Product], dealt: Iterator[int], *, boards: int) -> Plan:
+    """Draw what stands on the boards of a unit: a few articles on each, many packages of one side by side."""
     rows: list[tuple[Facing, ...]] = []
     for _ in range(boards):
         row: list[Facing] = []
         x, stop = 0.04, UNIT_M - 0.04
         while True:
-            article = int(rng.choice(fitting))
+            article = next(dealt)
             wide = articles[article].size_m[0]
-            count = min(int(rng.integers(2, 5)), int((stop - x) / wide))
+            count = min(int(rng.integers(3, 7)), int((stop - x) / wide))
             if count < 1:
                 break
             row.append(Facing(article, x, count))
@@ -69,7 +78,7 @@ def shelf_unit(
     sold_out: float = 0.05,
 ) -> None:
     """Add one unit of shelves with its back on y = 0; ``sold_out`` is the share of facings that are missing."""
-    steel, rail = paint(build, _STEEL), build.shared("rail", lambda: pictures.price_rail(np.random.default_rng(5), 1.0))
+    steel, rail = paint(build, _STEEL), build.shared("rail", lambda: pictures.price_rail(UNIT_M))
     inner = UNIT_M - 0.01
     step = (height_m - 0.16) / len(content)
     with build.thing("shelf unit", place, kind="fixed"):
@@ -97,6 +106,15 @@ def shelf_unit(
                 if rng.random() >= sold_out:
                     _goods(build, rng, moved(place, -inner / 2, deep, z), articles, stock)
         build.block(moved(place, y_m=DEPTH_M / 2), (UNIT_M, DEPTH_M))
+
+
+def header(build: Builder, rng: np.random.Generator, place: Pose, *, up_m: float) -> None:
+    """Put a sign on top of a unit that stands with its back on y = 0."""
+    size = (float(rng.uniform(0.6, 0.95)), float(rng.uniform(0.22, 0.34)))
+    board = paint(build, (150, 152, 154))
+    image = pictures.promotion(rng, size)
+    at = moved(place, float(rng.uniform(-0.02, 0.02)), 0.03)
+    forms.hang(build, at, size, image, up_m=up_m + size[1] / 2 + 0.016, frame=board, name="promotion", off_m=0.02)
 
 
 def _goods(build: Builder, rng: np.random.Generator, place: Pose, articles: list[Product], stock: Facing) -> None:
