@@ -73,13 +73,14 @@ def _chains(textures: Sequence[Rgb]) -> tuple[Words, Longs]:
 
 
 def _fill(texels: Words, levels: Longs, image: Rgb) -> None:
-    level: NDArray[np.uint8] | NDArray[np.float32] = image
+    level = image.astype(np.float32)
     for k, (start, width, height) in enumerate(levels):
         if k > 0:
-            area = level if level.dtype == np.float32 else image.astype(np.float32)
-            level = cv2.resize(area, (int(width), int(height)), interpolation=cv2.INTER_AREA)
-        red, green, blue = np.moveaxis(np.rint(level).astype(np.uint32), 2, 0)
-        packed = red | blue << np.uint32(10) | green << np.uint32(21)
-        texels[start : start + width * height] = packed.ravel()
+            level = cv2.resize(level, (int(width), int(height)), interpolation=cv2.INTER_AREA)
+        whole = (image if k == 0 else np.rint(level)).astype(np.uint32)
+        into = texels[start : start + width * height].reshape(height, width)
+        into[:] = whole[..., 0]
+        into |= whole[..., 2] << np.uint32(10)
+        into |= whole[..., 1] << np.uint32(21)
         if width == 1 and height == 1:
             break

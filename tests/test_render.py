@@ -16,7 +16,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import CameraError
 from fieldkit.frames import Pose
 from sim_bridge.mesh import Scene
-from sim_bridge.rendering import RENDERERS, render
+from sim_bridge.rendering import RENDERERS, render, render_depth
 from sim_bridge.scenes import make_scene
 
 Array = NDArray[np.float64]
@@ -243,6 +243,58 @@ def test_a_field_of_view_wider_than_a_plane_holds_is_refused(tag: Scene) -> None
     wide = Camera("OPENCV_FISHEYE", 640, 480, (200.0, 200.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(CameraError, match="field of view too wide"):
         render(tag, wide, Pose.identity())
+
+
+def test_depth_alone_is_the_depth_of_the_image(room: Scene) -> None:
+    pose = look(np.array([0.9, 0.9, 1.6]), np.array([5.0, 4.0, 0.9]))
+    for camera in (PINHOLE, DISTORTED):
+        assert np.array_equal(render_depth(room, camera, pose), render(room, camera, pose).depth_m)
+
+
+def subdivided(scene: Scene) -> Scene:
+    """Cut every face into four of the same surface."""
+    halves = 0.5 * np.array([[[2, 0, 0], [1, 1, 0], [1, 0, 1]], [[1, 1, 0], [0, 2, 0], [0, 1, 1]]])
+    inner = 0.5 * np.array([[[1, 0, 1], [0, 1, 1], [0, 0, 2]], [[1, 1, 0], [0, 1, 1], [1, 0, 1]]])
+    weights = np.concatenate([halves, inner])
+    corners = np.einsum("kcj,mjx->mkcx", weights, scene.vertices[scene.faces])
+    return dataclasses.replace(
+        scene,
+        vertices=corners.reshape(-1, 3),
+        faces=np.arange(12 * len(scene.faces), dtype=np.int32).reshape(-1, 3),
+        uv=np.einsum("kcj,mjx->mkcx", weights, scene.uv).reshape(-1, 3, 2).astype(np.float32),
+        shade=np.einsum("kcj,mj->mkc", weights, scene.shade).reshape(-1, 3).astype(np.float32),
+        texture=np.repeat(scene.texture, 4),
+        closed=np.repeat(scene.closed, 4),
+    )
+
+
+def test_a_finer_mesh_of_the_same_surface_gives_the_same_image(room: Scene, rng: np.random.Generator) -> None:
+    fine = subdivided(subdivided(room))
+    for height in rng.uniform(0.4, 1.8, 3):
+        level = look(np.array([4.5, 5.8, height]), np.array([*rng.uniform([0, 0], [9, 7]), height]))
+        coarse_image, fine_image = render(room, PINHOLE, level), render(fine, PINHOLE, level)
+        difference = np.abs(coarse_image.rgb.astype(np.int64) - fine_image.rgb)
+        assert (difference > 2).mean() < 2e-3
+        assert difference.mean() < 0.05
+        assert (np.abs(coarse_image.depth_m - fine_image.depth_m) > 1e-5).mean() < 1e-4
+
+
+def test_a_derived_scene_shares_what_it_was_made_from_and_looks_as_if_made_at_once(room: Scene) -> None:
+    tag = np.kron(np.indices((8, 8)).sum(axis=0) % 2 * 255, np.ones((8, 8))).astype(np.uint8)
+    at = Pose.from_components([4.0, 3.5, 1.0], Rotation.from_euler("x", 90, degrees=True))
+    board = at * Pose.from_components([0.0, 0.0, -0.02], Rotation.identity())
+    derived = room.with_box(board, (0.5, 0.5, 0.02), rgb=(200, 30, 30)).with_quad(at, 0.4, 0.4, tag)
+    derived = derived.with_block(np.zeros((4, 2)))
+    whole = dataclasses.replace(derived)
+    assert derived.mips.texels is room.mips.texels
+    assert len(derived.mips.added) < len(whole.mips.texels) / 5
+    pose = look(np.array([4.2, 1.5, 1.3]), np.array([4.0, 3.5, 1.0]))
+    first, second = render(derived, PINHOLE, pose), render(whole, PINHOLE, pose)
+    assert not np.array_equal(first.rgb, render(room, PINHOLE, pose).rgb)
+    assert np.array_equal(first.depth_m, second.depth_m)
+    assert (first.rgb == second.rgb).all(axis=2).mean() > 0.9999
+    rays = np.random.default_rng(0).standard_normal((1000, 3))
+    assert np.array_equal(derived.intersect(pose.translation, rays), whole.intersect(pose.translation, rays))
 
 
 def test_every_renderer_of_the_table_draws_the_room(room: Scene) -> None:

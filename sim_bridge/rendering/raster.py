@@ -185,7 +185,8 @@ def _band(
 
 @parallel_kernel
 def draw(mesh: Mesh, view: View, bins: Bins, textures: Textures, samples: int, bands: int, picture: Picture) -> Floats:
-    """Draw binned clusters into a picture; ``samples`` is 4 (rotated grid) or 1 (pixel centre).
+    """Draw binned clusters into a picture; ``samples`` is 4 (rotated grid), 1 (pixel centre) or 0 (no
+    colour).
 
     Bands of tiles are drawn in parallel. Returns the planes f64[k,21] of the triangles that picture.seen names.
     """

@@ -268,7 +268,7 @@ def resolve(
     scratch: Scratch,
     picture: Picture,
 ) -> None:
-    """Turn the visibility buffer of the tile at pixel (x, y) into colour and depth."""
+    """Turn the visibility buffer of the tile at pixel (x, y) into depth and, unless samples is 0, colour."""
     height, width = picture.depth.shape
     layers = 5 if samples > 1 else 1
     tile = Tile(owner, samples, layers, x, y, min(TILE_H, height - y), min(TILE_W, width - x))
@@ -281,5 +281,6 @@ def resolve(
             for i in range(length):
                 depth[i] = 1.0 / near[i] if near[i] > 0.0 else 0.0
                 seen[i] = owners[i]
-    count = list_fragments(tile, mesh, textures.levels, out, scratch.fragments)
-    _colour(count, tile, out, textures, scratch, picture.rgb)
+    if samples > 0:
+        count = list_fragments(tile, mesh, textures.levels, out, scratch.fragments)
+        _colour(count, tile, out, textures, scratch, picture.rgb)
