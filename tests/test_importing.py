@@ -1,0 +1,256 @@
+"""Meshes of one's own: what is read, what becomes of colours and textures, the floor, and every refusal in one line."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from fieldkit.cameras import Camera
+from sim_bridge import cli
+from sim_bridge.aim import aim
+from sim_bridge.errors import SynthesisError
+from sim_bridge.importing import MeshOptions, import_scene
+from sim_bridge.mesh import Scene
+from sim_bridge.rendering import render
+from sim_bridge.stage import tours
+
+CAMERA = Camera("PINHOLE", 160, 120, (120.0, 120.0, 80.0, 60.0))
+LENGTH_M, WIDTH_M, HEIGHT_M = 6.0, 5.0, 2.8
+
+
+def quad(corners: list[tuple[float, float, float]]) -> trimesh.Trimesh:
+    """A rectangle with texture coordinates 0..1, its first corner at the texture's lower left."""
+    mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=np.float64))
+    return mesh
+
+
+def shell(length: float = LENGTH_M, width: float = WIDTH_M) -> list[trimesh.Trimesh]:
+    """Floor and four walls of a room without a ceiling, seen from inside."""
+    ring = [(0.0, 0.0), (length, 0.0), (length, width), (0.0, width)]
+    walls = [
+        quad([(*a, 0.0), (*b, 0.0), (*b, HEIGHT_M), (*a, HEIGHT_M)])
+        for a, b in zip(ring, ring[1:] + ring[:1], strict=True)
+    ]
+    return [quad([(x, y, 0.0) for x, y in ring]), *walls]
+
+
+def table() -> trimesh.Trimesh:
+    """A plate on 0.7 m at (4.5, 2.5)."""
+    top = trimesh.creation.box((1.0, 1.0, 0.05), trimesh.transformations.translation_matrix((4.5, 2.5, 0.7)))
+    top.visual.face_colors = (90, 60, 30, 255)
+    return top
+
+
+def checks(px: int = 64) -> Image.Image:
+    """Red upper left, green upper right, blue lower left, white lower right."""
+    image = np.zeros((px, px, 3), np.uint8)
+    half = px // 2
+    image[:half, :half] = (250, 0, 0)
+    image[:half, half:] = (0, 250, 0)
+    image[half:, :half] = (0, 0, 250)
+    image[half:, half:] = (250, 250, 250)
+    return Image.fromarray(image)
+
+
+def painted(parts: list[trimesh.Trimesh], image: Image.Image | None = None) -> list[trimesh.Trimesh]:
+    for part in parts:
+        material = trimesh.visual.material.SimpleMaterial(
+            image=image or checks(), name="paint", diffuse=(255, 255, 255)
+        )
+        part.visual = trimesh.visual.TextureVisuals(uv=part.visual.uv, material=material)
+    return parts
+
+
+def coloured(parts: list[trimesh.Trimesh], rgb: tuple[int, int, int]) -> list[trimesh.Trimesh]:
+    for part in parts:
+        part.visual = trimesh.visual.ColorVisuals(part, vertex_colors=np.tile((*rgb, 255), (len(part.vertices), 1)))
+    return parts
+
+
+def saved(path: Path, parts: list[trimesh.Trimesh]) -> Path:
+    scene = trimesh.Scene(parts)
+    if path.suffix == ".ply":
+        trimesh.util.concatenate(parts).export(path)
+    else:
+        scene.export(path)
+    return path
+
+
+def looking_north(scene: Scene, *, yaw_deg: float = 90.0) -> np.ndarray:
+    return render(scene, CAMERA, aim([3.0, 1.5, 1.4], np.radians(yaw_deg))).rgb
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    return saved(tmp_path / "room.glb", [*painted(shell()), table()])
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj"])
+def test_textures_lie_as_they_were_drawn(tmp_path: Path, kind: str) -> None:
+    seen = looking_north(import_scene(saved(tmp_path / f"room.{kind}", painted(shell()))))
+    # The north wall's corners run from the east: seen from inside, its texture reads from right to left.
+    assert seen[20, 120].tolist() == [250, 0, 0]
+    assert seen[20, 40].tolist() == [0, 250, 0]
+    assert seen[85, 120].tolist() == [0, 0, 250]
+    assert seen[85, 40].tolist() == [250, 250, 250]
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_vertex_colours_are_seen(tmp_path: Path, kind: str) -> None:
+    seen = looking_north(import_scene(saved(tmp_path / f"room.{kind}", coloured(shell(), (200, 120, 40)))))
+    assert np.abs(seen[20:80, 20:140].astype(int) - (200, 120, 40)).max() <= 3
+
+
+def test_colours_change_evenly_between_vertices(tmp_path: Path) -> None:
+    parts = coloured(shell(), (250, 0, 0))
+    # Red at the north wall's east end, blue at its west end.
+    parts[3].visual.vertex_colors[[1, 2]] = (0, 0, 250, 255)
+    seen = looking_north(import_scene(saved(tmp_path / "room.ply", parts)))[50].astype(int)
+    assert (np.diff(seen[40:120, 0]) >= -1).all()
+    assert (np.diff(seen[40:120, 2]) <= 1).all()
+    assert seen[100, 0] - seen[60, 0] > 40
+
+
+def test_textures_repeat_outside_of_their_image(tmp_path: Path) -> None:
+    parts = painted(shell())
+    for part in parts:
+        part.visual.uv = 10.0 * part.visual.uv - 3.0
+    scene = import_scene(saved(tmp_path / "room.obj", parts))
+    wall = looking_north(scene)[10:90, 10:150]
+    blue, red = (wall[..., 2] > 200) & (wall[..., 0] < 50), (wall[..., 0] > 200) & (wall[..., 2] < 50)
+    assert 0.15 < blue.mean() < 0.35
+    assert 0.15 < red.mean() < 0.35
+    stripes = cv2.connectedComponents(red.astype(np.uint8))[0] - 1
+    assert stripes > 15
+
+
+def test_free_floor_is_where_nothing_stands(room: Path) -> None:
+    scene = import_scene(room)
+    spots = [(1.5, 2.5), (4.5, 2.5), (0.2, 2.5), (3.5, 0.5), (8.0, 2.5), (3.7, 2.5)]
+    assert scene.free_floor(spots, 0.36).tolist() == [True, False, False, True, False, False]
+    assert scene.free_floor([(1.5, 2.5)], 1.3).all()
+    assert not scene.free_floor([(1.5, 2.5)], 1.7).any()
+
+
+def test_a_tour_of_a_mesh_stays_on_its_floor(room: Path) -> None:
+    scene = import_scene(room)
+    loop = tours.tour(scene)
+    assert scene.free_floor(loop, 0.3).all()
+    assert loop[:, 0].max() - loop[:, 0].min() > 2.0
+
+
+def test_the_largest_floor_lies_at_zero(tmp_path: Path) -> None:
+    lower = painted(shell())
+    upper = painted(shell(3.0, 2.0))
+    for part in lower:
+        part.apply_translation((0.0, 0.0, -3.2))
+    for part in upper:
+        part.apply_translation((0.0, 0.0, 0.1))
+    scene = import_scene(saved(tmp_path / "two.glb", lower + upper))
+    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
+    assert scene.free_floor([(5.0, 4.0)], 0.36).all()
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0)])
+def test_another_unit_is_refused_until_it_is_said(tmp_path: Path, unit: str, factor: float) -> None:
+    parts = painted(shell())
+    for part in parts:
+        part.apply_scale(factor)
+    path = saved(tmp_path / "room.glb", parts)
+    with pytest.raises(SynthesisError, match=rf"room.glb: .* m, too large .*expected metres.*--unit {unit}") as error:
+        import_scene(path)
+    assert "\n" not in str(error.value)
+    scene = import_scene(path, MeshOptions(unit=unit))  # type: ignore[arg-type]
+    assert np.allclose(scene.bounds[1], [LENGTH_M, WIDTH_M, HEIGHT_M])
+
+
+def test_y_up_is_refused_until_it_is_said(tmp_path: Path) -> None:
+    parts = painted(shell())
+    for part in parts:
+        part.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    path = saved(tmp_path / "room.glb", parts)
+    with pytest.raises(SynthesisError, match=r"room.glb: y seems to be up.*expected z up; give --up y"):
+        import_scene(path)
+    scene = import_scene(path, MeshOptions(up="y"))
+    assert np.allclose(scene.bounds[1], [LENGTH_M, WIDTH_M, HEIGHT_M])
+    assert scene.free_floor([(3.0, 2.5)], 0.36).all()
+
+
+def test_points_without_faces_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scan.ply"
+    trimesh.PointCloud(np.random.default_rng(0).uniform(0, 5, (50, 3))).export(path)
+    with pytest.raises(SynthesisError, match=r"scan.ply: a mesh without faces \(50 points\); expected triangles"):
+        import_scene(path)
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
+def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path, kind: str) -> None:
+    mesh = trimesh.util.concatenate(coloured(shell(), (9, 9, 9)))
+    mesh.vertices[3, 1] = np.nan
+    path = tmp_path / f"room.{kind}"
+    mesh.export(path)
+    with pytest.raises(SynthesisError, match=rf"room.{kind}: .*1 of \d+ vertices are not finite; expected numbers"):
+        import_scene(path)
+
+
+def test_missing_textures_are_grey_and_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = saved(tmp_path / "room.obj", painted(shell()))
+    for image in tmp_path.glob("*.png"):
+        image.unlink()
+    with caplog.at_level(logging.WARNING):
+        scene = import_scene(path)
+    assert len([r for r in caplog.records if "room.obj: no texture for" in r.getMessage()]) == 1
+    wall = looking_north(scene)[20:80, 20:140]
+    assert np.ptp(wall) == 0
+    assert 100 < wall.mean() < 200
+
+
+def test_a_floor_narrower_than_the_robot_is_refused(tmp_path: Path) -> None:
+    path = saved(tmp_path / "gap.glb", painted(shell(6.0, 0.6)))
+    with pytest.raises(SynthesisError, match=r"gap.glb: no free floor for a robot .*expected 1 m2 .*0.36 m"):
+        import_scene(path, MeshOptions(up="z"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("room.stl", b"solid", r"unknown kind of mesh '.stl'; expected .glb, .obj, .ply"),
+        ("room.glb", b"no mesh at all", r"cannot be read as GLB"),
+        ("room.ply", b"", r"cannot be read as PLY|without faces"),
+        ("gone.obj", None, r"no such file"),
+    ],
+)
+def test_files_that_are_no_meshes_end_in_one_line_and_leave_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes | None, message: str
+) -> None:
+    path, out = tmp_path / name, tmp_path / "session"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SystemExit, match="1"):
+        cli.main(["synthesize", "--scene", str(path), "--out", str(out)])
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert name in said[0]
+    with pytest.raises(SynthesisError, match=message):
+        import_scene(path)
+    assert not out.exists()
+
+
+def test_a_foreign_house_is_read_with_its_floor(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        scene = import_scene(shared_data / "small_house" / "small_house.glb")
+    assert "no texture for 3 of 108 parts" in caplog.text
+    assert np.allclose(np.ptp(scene.bounds, axis=0), [19.0, 11.4, 3.0], atol=0.01)
+    graph, _ = tours.walkable(scene)
+    assert 70.0 < 0.01 * len(graph.centres) < 150.0
+    assert 150.0 < tours.shown_area_m2(scene, graph) < 217.0
+    free = graph.centres[:: len(graph.centres) // 200]
+    below = scene.intersect(np.column_stack([free, np.full(len(free), 1.7)]), [0.0, 0.0, -1.0])
+    assert np.abs(below - 1.7).max() < 0.06
