@@ -16,7 +16,7 @@ from fieldkit.frames import Pose
 from fieldkit.store import Rig, RigCamera
 from sim_bridge.aim import UPRIGHT_FROM_CAM, turn
 from sim_bridge.mesh import Scene
-from sim_bridge.rendering import render
+from sim_bridge.rendering import render, render_depth
 from sim_bridge.sensors import ColourSensor, DepthSensor, Motion, bent, effects, encode, expose, sense_depth
 from sim_bridge.stage import tours
 
@@ -214,7 +214,7 @@ def depths(
     mounted = hololens_rig().depth
     assert mounted is not None
     for station in stations:
-        exact = render(scene, mounted.camera, station.world_from_rig * mounted.rig_from_cam).depth_m
+        exact = render_depth(scene, mounted.camera, station.world_from_rig * mounted.rig_from_cam)
         measured = sense_depth(exact, sensor, camera=mounted.camera, rng=rng)
         yield f"{station.frame}.png", effects.depth_png(measured, far_m=DEPTH_FAR_M)
 

@@ -18,7 +18,7 @@ from fieldkit.frames import Pose
 from sim_bridge import robot
 from sim_bridge.errors import SynthesisError
 from sim_bridge.recording.schedule import Schedule, Shot
-from sim_bridge.rendering import render
+from sim_bridge.rendering import render, render_depth
 from sim_bridge.robot.odometry import OdometryOptions, drifting_odometry
 from sim_bridge.sensors import STANDARD, Motion, Sensors, bent, effects, encode, expose, sense_depth
 from sim_bridge.stage.staging import Stage
@@ -144,7 +144,7 @@ def _taken(
     seen = render(stage.scene, camera, world_from_cam)
     image = expose(seen.rgb, sensors.hand, camera=camera, rng=rng, motion=motion, depth_m=seen.depth_m)
     world_from_depth = schedule.world_from_body(shot.t_s) * kinematics.body_from_depth(schedule.joints(shot.t_s))
-    exact = render(stage.scene, robot.DEPTH_CAMERA, world_from_depth, samples=1).depth_m
+    exact = render_depth(stage.scene, robot.DEPTH_CAMERA, world_from_depth)
     depth = sense_depth(exact, sensors.hand_depth, camera=robot.DEPTH_CAMERA, rng=rng)
     png = effects.depth_png(depth, far_m=np.iinfo(np.uint16).max / 1000.0)
     return SensedImage(stamp(shot.t_s), encode(image, sensors.hand), png, world_from_cam)
