@@ -46,8 +46,9 @@ def fuse_depth(
     views = list(views)
     truncation = 3.5 * voxel_m if truncation_m is None else truncation_m
     rays = _pixel_rays(camera)
-    low, high = _extent(views, rays, max_depth_m)
-    low, high = low - 2 * truncation, high + 2 * truncation
+    low, high = _extent(views, camera, max_depth_m)
+    # Voxels stand at multiples of their size: the last bits of the extent do not move the surface.
+    low, high = np.floor((low - 2 * truncation) / voxel_m) * voxel_m, high + 2 * truncation
     shape = np.ceil((high - low) / voxel_m).astype(int) + 1
     if float(np.prod(shape.astype(float))) > _MAX_VOXELS:
         raise SurfaceError(
@@ -74,14 +75,19 @@ def _pixel_rays(camera: Camera) -> Array:
     return camera.unproject(np.column_stack([u.ravel(), v.ravel()]))
 
 
-def _extent(views: list[DepthView], rays: Array, max_depth_m: float) -> tuple[Array, Array]:
+def _extent(views: list[DepthView], camera: Camera, max_depth_m: float) -> tuple[Array, Array]:
+    """Return the lowest and highest corner (3,) of all measured points: what lies beyond them needs no voxels."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = camera.unproject(np.column_stack([u.ravel(), v.ravel()])).astype(np.float32)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for map_from_cam, read in views:
-        depth = read()
-        valid = depth[(depth > 0) & (depth <= 1000 * max_depth_m)]
-        if valid.size:
-            corners = map_from_cam.apply(np.concatenate([[[0.0, 0.0, 0.0]], rays * float(valid.max()) / 1000.0]))
-            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+        depth = read().ravel()
+        valid = (depth > 0) & (depth <= 1000 * max_depth_m)
+        if valid.any():
+            points = rays[valid] * (depth[valid, None] * np.float32(0.001))
+            points = points @ map_from_cam.rotation.as_matrix().T.astype(np.float32)
+            low = np.minimum(low, points.min(axis=0) + map_from_cam.translation)
+            high = np.maximum(high, points.max(axis=0) + map_from_cam.translation)
     if not np.isfinite(low).all():
         raise SurfaceError(
             "no depth image has a valid depth", hint="depth is 16-bit PNG in mm along the optical axis, 0 = none"
