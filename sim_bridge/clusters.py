@@ -38,10 +38,7 @@ class Clusters:
 
 
 def clusters(vertices: Floats, faces: Ints, *, first: int = 0) -> Clusters:
-    """Cut faces int32[m,3] into clusters along a Morton curve through their centres; ``first`` is the first's index.
-
-    Faces of one side of the dominant axis stay together, so that a cluster tends to be seen or not as a whole.
-    """
+    """Cut faces int32[m,3] into clusters along a Morton curve through their centres; ``first`` is the first's index."""
     count = len(faces)
     corners = vertices[faces] if count else np.zeros((0, 3, 3))
     low, high = corners.min(axis=1), corners.max(axis=1)

@@ -32,10 +32,7 @@ class Mips:
     base: int
 
     def extended(self, textures: Sequence[Rgb]) -> Mips:
-        """Return the mip chains with further textures; the large array of the chains that exist is shared.
-
-        Raises nothing; extending what is extended already copies what was added.
-        """
+        """Return the mip chains with further textures: ``texels`` is shared, only ``added`` is copied."""
         texels, levels = _chains(textures)
         kept = self.added[: len(self.added) - _margin(self.levels[self.base :])]
         levels[:, :, 0] += len(kept)
