@@ -35,7 +35,7 @@ from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_f
 LENGTH_M, WIDTH_M, HEIGHT_M = 12.4, 9.0, 3.9
 WAITING_X, GATES_Y = 4.4, 6.3
 _PX_PER_M, _FLOOR_PX_PER_M = 110, 130
-_HUNG_SHARE = 0.6
+_HUNG_SHARE = 0.75
 _WINDOW_POWER, _LAMP_POWER, _SPOT_POWER = 9.0, 2.6, 1.2
 
 Line = tuple[tuple[float, float], tuple[float, float]]
@@ -51,8 +51,8 @@ _PILLARS = ((3.3, 3.1), (8.3, 3.6), (5.45, GATES_Y))
 
 # Stretches of walls (from, to in m from their start) on which prints hang, and how high.
 _GALLERIES: tuple[tuple[Line, Literal["left", "right"], float, tuple[tuple[float, float], ...]], ...] = (
-    (_SOUTH, "left", 1.5, ((0.2, 1.4), (2.4, 3.25), (9.4, 11.6))),
-    (_EAST, "left", 1.65, ((0.9, 3.6), (7.1, 8.8))),
+    (_SOUTH, "left", 1.5, ((0.2, 1.4), (2.4, 3.25), (9.4, 12.1))),
+    (_EAST, "left", 1.65, ((0.4, 3.7), (6.0, 8.8))),
     (_NORTH, "left", 1.75, ((2.8, 3.2), (4.75, 5.2), (9.3, 10.0))),
     (_WEST, "left", 1.5, ((2.9, 4.2), (6.6, 8.7))),
     (_WAITING_EAST, "left", 1.5, ((0.2, 1.9),)),
@@ -69,7 +69,7 @@ def lobby(seed: int) -> Blueprint:
     look = furniture.make(build, rng)
     _walls(build, rng)
     _floor(build, rng)
-    _lamps(build)
+    _lamps(build, rng)
     _reception(build, rng, look)
     _gates_and_lifts(build, rng, look)
     _seats(build, rng, look)
@@ -126,12 +126,17 @@ def _floor(build: Builder, rng: np.random.Generator) -> None:
     build.panel(spot, (2.8, 1.3), mat, cell_m=0.13, solid=False)
 
 
-def _lamps(build: Builder) -> None:
+def _lamps(build: Builder, rng: np.random.Generator) -> None:
+    """Add lamps in a grid, vents here and there, and spots over the reception."""
     turn = Rotation.from_euler("x", np.pi)
     for x in (np.arange(6) + 0.5) * LENGTH_M / 6:
         for y in (1.1, 3.35, 5.6, 7.85):
             under = Pose.from_components([x, y, HEIGHT_M - 0.01], turn)
             build.lamp(under, (0.6, 0.6), power=_LAMP_POWER, samples=(1, 1))
+    vent = build.texture(office_prints.grille((96, 96)))
+    for x, y in rng.uniform((0.8, 0.8), (LENGTH_M - 0.8, WIDTH_M - 0.8), (9, 2)):
+        above = Pose.from_components([x, y, HEIGHT_M - 0.004], turn)
+        build.panel(above, (0.58, 0.58), vent, solid=False)
     for y in (2.7, 3.65, 4.6):
         under = Pose.from_components([2.3, y, HEIGHT_M - 0.02], turn)
         build.lamp(under, (0.15, 0.15), power=_SPOT_POWER, group="spot", samples=(1, 1))
@@ -204,7 +209,18 @@ def _boards(build: Builder, rng: np.random.Generator, look: Make) -> None:
     furniture.kiosk(build, rng, look, yaw_pose([4.3, 5.95, 0.0], np.pi))
     size = (1.9, 1.3)
     _hang(build, _EAST, 4.9, size, prints.painting(rng, px(size, px_per_m=300)), up_m=1.75, name="painting")
-    for x, y, yaw in ((5.3, 5.0, 0.2), (9.6, 5.1, -0.3), (7.0, 2.1, 1.4), (3.0, 2.0, 1.9), (8.4, 7.9, 1.57)):
+    for (x, y), yaw in zip(_PILLARS, (-1.4, 2.4, -2.8), strict=True):
+        size = (0.42, 0.8)
+        at = on_wall(yaw_pose([x, y, 0.0], yaw + float(rng.normal(0, 0.2))), 0.0, 1.45, off_m=0.28)
+        hang(build, at, size, _picture(rng, size))
+    for x, y, yaw in (
+        (5.3, 5.0, 0.2),
+        (9.6, 5.1, -0.3),
+        (7.0, 2.1, 1.4),
+        (3.0, 2.0, 1.9),
+        (8.4, 7.9, 1.57),
+        (11.2, 7.8, 0.9),
+    ):
         furniture.banner(build, rng, look, yaw_pose([x, y, 0.0], yaw), ceiling_m=HEIGHT_M)
 
 
