@@ -18,13 +18,14 @@ from test_align import walk
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError, StoreError
 from fieldkit.features import extract
-from fieldkit.frames import Pose, pose_error, pose_from_matrix
+from fieldkit.frames import Pose, exp, pose_error, pose_from_matrix
 from fieldkit.localize import Localizer
 from fieldkit.maps import MapOptions, build_map, compact_map, content_digest, load_map, map_info
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, landmark_covariance, model_arrays, model_from_arrays
 from fieldkit.maps.pairs import choose_pairs
 from fieldkit.maps.rigs import write_cameras
 from fieldkit.maps.source import SourceImage, read_source
+from fieldkit.maps.strays import strays
 from fieldkit.store import Rig, RigCamera, write_camera, write_rig, write_tum
 from fieldkit.types import Surface
 
@@ -99,6 +100,18 @@ def test_a_rig_is_one_body_and_a_lone_camera_its_own(tmp_path: Path, rng: np.ran
         assert rig_from_cam is not None
         assert cameras[0] is not None
         assert np.allclose(found, (rig_from_cam.inv() * cameras[0]).as_matrix()[:3], atol=1e-12)
+
+
+def test_what_sfm_misplaced_is_told_from_what_slam_misplaced(rng: np.random.Generator) -> None:
+    images, poses = rig_images(rng)
+    slam = {i: pose * exp([0.0, 0.0, 0.0, 0.02, 0.0, 0.0]) for i, pose in poses.items()}
+    images = [dataclasses.replace(image, slam_from_cam=slam[i]) for i, image in enumerate(images)]
+    assert strays(images, poses, threshold_m=0.05) == []
+    leap = exp([0.0, 0.0, 0.0, 2.0, 0.0, 0.0])
+    misplaced = poses | {i: poses[i] * leap for i in (3, 4, 5)}
+    assert strays(images, misplaced, threshold_m=0.05) == [3, 4, 5]
+    jumping = [dataclasses.replace(im, slam_from_cam=slam[i] * leap) if i == 4 else im for i, im in enumerate(images)]
+    assert strays(jumping, poses, threshold_m=0.05) == []
 
 
 def test_pairs_do_not_depend_on_poses_and_hold_the_neighbours(rng: np.random.Generator) -> None:

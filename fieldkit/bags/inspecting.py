@@ -28,7 +28,8 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
     """Return what a recording holds and lacks as a dict for JSON; times in ns and s.
 
     Keys: version, path, name, format, duration_s, n_messages, layout (None when none fits), topics, images, depth,
-    odometry, joint_states, reference, starts, visits, warnings, missing. Raises BagError only for a file that cannot be opened or is damaged.
+    odometry, joint_states, reference, starts, visits, warnings, missing. Raises BagError only for a file that
+    cannot be opened or is damaged.
     """
     source = open_source(path)
     bag = source.bag

@@ -32,6 +32,7 @@ from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
 from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
 from fieldkit.maps.sfm import reconstruct, threads
 from fieldkit.maps.source import DepthFrame, MapSource, read_source
+from fieldkit.maps.strays import strays
 from fieldkit.store import atomic_folder
 from fieldkit.store.files import refuse_existing
 from fieldkit.surface import fuse_depth, write_ply
@@ -124,7 +125,7 @@ def build_map(
     clock.lap("reconstruct")
     sfm_poses = _registered(walk, model, options)
     alignment, warnings = _align(walk, model, sfm_poses, options, seed)
-    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
+    mapped, left_out = _placed(walk, model, sfm_poses, alignment)
     n_landmarks = _finish_model(walk, model, alignment.map_from_sfm, options.landmarks)
     clock.lap("align")
     surface, missing = _surface(walk, mapped, options, tell)
@@ -136,7 +137,7 @@ def build_map(
         places = _alignment_entry(alignment), _surface_entry(surface, options)
         write_map_file(folder, MapFile(1, digest, feature, *counts, *places))
     clock.lap("write")
-    found = (*warnings, *missing)
+    found = (*warnings, *left_out, *missing)
     return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, found)
 
 
@@ -229,6 +230,22 @@ def _scale_by_depth(
         sfm_centres=np.stack([sfm_poses[i].translation for i in posed]),
         slam_centres=np.stack([p.translation for p in posed.values()]),
     )
+
+
+def _placed(
+    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], alignment: Alignment
+) -> tuple[dict[int, Pose], list[str]]:
+    """Return map_from_cam by image index; images that SfM misplaced leave the model, with one warning."""
+    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in sfm_poses.items()}
+    wrong = strays(walk.images, mapped, threshold_m=alignment.threshold_m)
+    for frame_id in sorted({model.image(i + 1).frame_id for i in wrong}):
+        model.deregister_frame(frame_id)
+    for i in wrong:
+        del mapped[i]
+    if not wrong:
+        return mapped, []
+    names = ", ".join(walk.images[i].name for i in wrong[:4])
+    return mapped, [f"{len(wrong)} images left out, misplaced where things look alike: {names}"]
 
 
 def _finish_model(
