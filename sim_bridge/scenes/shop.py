@@ -162,9 +162,17 @@ def _signs(build: Builder, rng: np.random.Generator) -> None:
 
 
 def _poster_places(rng: np.random.Generator) -> list[tuple[Pose, tuple[float, float], float]]:
-    """Return wall frames, sizes and heights of the posters: few, in clusters, most of the wall stays blank."""
+    """Return wall frames, sizes and heights of the posters: in clusters, a good part of the walls stays blank."""
     places: list[tuple[Pose, tuple[float, float], float]] = []
-    for side, at in ((WEST, 8.6), (SOUTH, 8.85), (SOUTH, 11.0), (EAST, 2.7)):
+    for side, at in ((WEST, 8.6), (SOUTH, 8.85), (SOUTH, 11.0), (EAST, 2.7), (NORTH, 2.6)):
         size = (float(rng.uniform(0.6, 0.9)), float(rng.uniform(0.7, 1.1)))
         places.append((_HALL.on(side, at), size, 1.55))
+    # Banners above the shelves and fridges, for whoever looks up.
+    for side, at in ((WEST, 2.6), (WEST, 5.6), (NORTH, 5.5), (NORTH, 9.6), (EAST, 5.2), (SOUTH, 9.9)):
+        size = (float(rng.uniform(1.0, 1.5)), float(rng.uniform(0.4, 0.55)))
+        places.append((_HALL.on(side, at), size, 2.5))
+    # Two of the plain ends of rows.
+    for x in (_ROWS_X[0], _ROWS_X[2]):
+        end = yaw_pose([x, _ROW_START_M + 4.03, 0.0], 0.0)
+        places.append((end, (float(rng.uniform(0.5, 0.7)), float(rng.uniform(0.7, 0.9))), 0.95))
     return places

@@ -58,7 +58,7 @@ def plan(rng: np.random.Generator, articles: list[Product], dealt: Iterator[int]
         while True:
             article = next(dealt)
             wide = articles[article].size_m[0]
-            count = min(int(rng.integers(3, 7)), int((stop - x) / wide))
+            count = min(int(rng.integers(2, 6)), int((stop - x) / wide))
             if count < 1:
                 break
             row.append(Facing(article, x, count))
