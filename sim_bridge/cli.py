@@ -51,7 +51,7 @@ def synthesize(
         layout: names of topics and frames: generic, or those of a driver, spot_ros1 or spot_ros2
         waypoints: number of waypoints, each with a tripod tag
         starts: each waypoint reached from the start tag, as in the paper, or once for the whole session
-        stations: number of places at which the mapping rig takes its images; about one every 0.85 m by default
+        stations: number of places at which the mapping rig takes its images; by default three images per m2 or so
         quality: JPEG quality of the arm camera's images, 1 to 100; by default that of its sensor
         sensors: what the sensors add: standard, ideal (nothing), or a TOML file like a session's sensors.toml
         without: effects to switch off: lens, exposure, vignetting, noise, blur, jpeg, depth_noise, depth_holes

@@ -32,6 +32,8 @@ LOOP_STEP_M = 0.05
 # A quarter turn counts as a metre and a half of walking.
 METRES_PER_QUARTER_TURN = 1.5
 METRES_PER_STATION = 0.85
+# A tour is walked there and back, with fewer stations each way.
+METRES_PER_TOUR_STATION = 1.85
 MOST_STATIONS = 150
 # What 16 bits of millimetres can hold.
 DEPTH_FAR_M = 65.0
@@ -41,8 +43,8 @@ DEPTH_FAR_M = 65.0
 class WalkOptions:
     """How the walk is taken and how well the device tracks itself.
 
-    ``stations`` None takes one about every METRES_PER_STATION. ``laps`` above 1 repeats the beginning, so that the walk
-    closes. The drift is a random walk per root of metre.
+    ``stations`` None takes one about every METRES_PER_STATION, fewer on a tour. ``laps`` above 1 repeats the beginning,
+    so that the walk closes. The drift is a random walk per root of metre.
     """
 
     stations: int | None = None
@@ -95,12 +97,14 @@ def _mounted(position_m: tuple[float, float, float], yaw_deg: float, *, pitch_de
 def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tuple[Station, ...]:
     """Walk along the scene's loop and return the stations, evenly spaced, with natural bob and turning of the head.
 
-    A scene without a loop of its own is toured through all its free floor.
+    A scene without a loop of its own is toured through all its free floor, there and back: what is seen from one side
+    only does not help who comes from the other, and places that look alike are told apart by what lies around them.
     SLAM's frame starts below the first station, z up.
     """
     path, tangent = _smooth_loop(scene, step_m=LOOP_STEP_M)
     phase = rng.uniform(0.0, 2 * np.pi, 4)
-    at, metres = _places(len(path), tangent, options)
+    spacing_m = METRES_PER_STATION if len(scene.walk_xy) else METRES_PER_TOUR_STATION
+    at, metres = _places(len(path), tangent, options, spacing_m=spacing_m)
     count = len(at)
     around = np.radians(options.look_around_deg)
     yaw = tangent[at] + around * np.sin(2 * np.pi * metres / 5.3 + phase[0])
@@ -123,7 +127,7 @@ def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tup
     )
 
 
-def _places(length: int, heading: Array, options: WalkOptions) -> tuple[NDArray[np.intp], Array]:
+def _places(length: int, heading: Array, options: WalkOptions, *, spacing_m: float) -> tuple[NDArray[np.intp], Array]:
     """Return the index on the loop of every station and the metres walked there.
 
     A quarter turn takes as many stations as a metre and a half: views of neighbours overlap in bends, too.
@@ -134,7 +138,7 @@ def _places(length: int, heading: Array, options: WalkOptions) -> tuple[NDArray[
     turned = np.abs(np.diff(heading[rest] + laps * total_turn))
     per_rad = METRES_PER_QUARTER_TURN / (np.pi / 2)
     effort = np.concatenate([[0.0], np.cumsum(LOOP_STEP_M + turned * per_rad)])
-    count = options.stations or min(max(round(effort[-1] / METRES_PER_STATION), 12), MOST_STATIONS)
+    count = options.stations or min(max(round(effort[-1] / spacing_m), 12), MOST_STATIONS)
     wanted = np.linspace(0.0, effort[-1], count, endpoint=False)
     place = np.searchsorted(effort, wanted)
     return rest[place].astype(np.intp), place.astype(np.float64) * LOOP_STEP_M
@@ -142,7 +146,10 @@ def _places(length: int, heading: Array, options: WalkOptions) -> tuple[NDArray[
 
 def _smooth_loop(scene: Scene, *, step_m: float) -> tuple[Array, Array]:
     """Return the scene's loop as points (n, 2), rounded as far as the free floor allows, and its heading (n,)."""
-    loop = scene.walk_xy if len(scene.walk_xy) else tours.tour(scene)
+    loop = scene.walk_xy
+    if not len(loop):
+        there = tours.tour(scene)
+        loop = np.concatenate([there, there[::-1]])
     corners = np.vstack([loop, loop[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     count = max(round(along[-1] / step_m), 8)

@@ -18,7 +18,7 @@ WALKER_RADII_M = (0.36, 0.28, 0.2)
 EYE_M = 1.65
 STEP_M = 0.05
 # The tour passes all free floor within the first of these distances that keeps it shorter than METRES_PER_M2.
-REACHES_M = (0.9, 1.1, 1.3, 1.6, 2.0, 2.5)
+REACHES_M = (1.0, 1.2, 1.4, 1.6, 1.8, 2.2)
 METRES_PER_M2 = 0.55
 # Nooks of free floor smaller than this are seen from outside.
 NOOK_M2 = 0.25
@@ -34,11 +34,11 @@ def tour(scene: Scene) -> Array:
     longest = METRES_PER_M2 * shown_area_m2(scene, graph)
     loop = np.empty((0, 2))
     for reach_m in REACHES_M:
-        stops = _stops(graph, reach_m)
-        loop = _loop(graph, stops)
+        corners = _loop(graph, _stops(graph, reach_m))
+        loop = smoothed_loop(scene, corners, radius_m=radius_m)
         if _length(loop) <= longest:
             break
-    return smoothed_loop(scene, loop, radius_m=radius_m)
+    return loop
 
 
 def walkable(scene: Scene) -> tuple[FloorGraph, float]:

@@ -1,0 +1,142 @@
+"""Mapping walks through free floor, and walls for the start tag, in scenes of several rooms."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from fieldkit.frames import Pose
+from sim_bridge.errors import SynthesisError
+from sim_bridge.mapping import mapper
+from sim_bridge.mesh import Clearance, Scene
+from sim_bridge.scenes import make_blueprint
+from sim_bridge.scenes.light import unlit
+from sim_bridge.stage import staging, tours
+from sim_bridge.stage.paths import floor_graph
+
+SCENES = ("clinic", "office")
+
+
+@functools.cache
+def scene(name: str) -> Scene:
+    return unlit(make_blueprint(name, 0))
+
+
+@functools.cache
+def tour(name: str) -> np.ndarray:
+    return tours.tour(scene(name))
+
+
+def empty(size: tuple[float, float], blocks: list[tuple[float, float, float, float]]) -> Scene:
+    """A floor with footprints (x0, y0, x1, y1) and nothing to see."""
+    corners = [[x0, y0, x1, y0, x1, y1, x0, y1] for x0, y0, x1, y1 in blocks]
+    return Scene(
+        vertices=np.zeros((0, 3)),
+        faces=np.zeros((0, 3), np.int32),
+        uv=np.zeros((0, 3, 2), np.float32),
+        texture=np.zeros(0, np.int32),
+        textures=(),
+        closed=np.zeros(0, np.bool_),
+        shade=np.zeros((0, 3), np.float32),
+        blocks=np.array(corners, dtype=np.float64).reshape(-1, 8),
+        walk_xy=np.zeros((0, 2)),
+        floor_bounds=(0.0, 0.0, *size),
+    )
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_tour_is_closed_and_stays_on_free_floor(name: str) -> None:
+    loop = tour(name)
+    assert np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).max() < 0.12
+    assert scene(name).free_floor(loop, 0.3).all()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_tour_passes_near_all_free_floor(name: str) -> None:
+    graph, _ = tours.walkable(scene(name))
+    off, _ = cKDTree(tour(name)).query(graph.centres)
+    assert off.max() < 2.5
+    assert np.quantile(off, 0.95) < 1.6
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_tour_is_about_a_metre_per_two_square_metres_and_has_three_images_for_each(name: str) -> None:
+    graph, _ = tours.walkable(scene(name))
+    area = tours.shown_area_m2(scene(name), graph)
+    stations = mapper.walk(scene(name), mapper.WalkOptions(), rng=np.random.default_rng(0))
+    assert 0.3 * area < np.linalg.norm(np.roll(tour(name), -1, axis=0) - tour(name), axis=1).sum() < 0.6 * area
+    assert 2.5 < 4 * len(stations) / area < 4.0
+    assert 4 * len(stations) <= 600
+
+
+def test_a_tour_is_walked_both_ways() -> None:
+    stations = mapper.walk(empty((8.0, 4.0), []), mapper.WalkOptions(stations=40), rng=np.random.default_rng(0))
+    at = np.array([s.world_from_rig.translation[:2] for s in stations])
+    ahead = np.array([s.world_from_rig.rotation.apply([1.0, 0.0, 0.0])[:2] for s in stations])
+    near = np.linalg.norm(at[:, None] - at[None], axis=2) < 0.8
+    against = ahead @ ahead.T < -0.7
+    assert (near & against).any(axis=1).mean() > 0.6
+
+
+def test_a_tour_goes_through_doors_into_every_room_of_the_connected_floor() -> None:
+    # Two rooms with a door in between, and a third without one.
+    plan = empty((9.0, 4.0), [(3.9, 0.0, 4.0, 1.5), (3.9, 2.5, 4.0, 4.0), (7.0, 0.0, 7.1, 4.0)])
+    loop = tours.tour(plan)
+    assert loop[:, 0].min() < 2.0
+    assert 5.0 < loop[:, 0].max() < 7.0
+
+
+def test_walkers_make_themselves_narrow_where_they_must() -> None:
+    graph, radius_m = tours.walkable(empty((6.0, 0.8), []))
+    assert radius_m == 0.28
+    assert len(graph.centres) > 20
+    with pytest.raises(SynthesisError, match="no free floor"):
+        tours.walkable(empty((6.0, 0.35), []))
+
+
+def test_clearance_narrows_the_floor_like_blocks_do() -> None:
+    distance = np.minimum(*np.meshgrid(np.arange(40) * 0.05, np.arange(40) * 0.05, indexing="ij")).astype(np.float32)
+    plan = empty((2.0, 2.0), [(1.5, 1.5, 1.6, 1.6)])
+    limited = Scene(**{**plan.__dict__, "clearance": Clearance(distance, (0.0, 0.0), 0.05)})
+    spots = [(1.0, 1.0), (0.35, 1.0), (1.0, 0.35), (1.45, 1.45)]
+    assert plan.free_floor(spots, 0.34).tolist() == [True, True, True, False]
+    assert limited.free_floor(spots, 0.34).tolist() == [True, False, False, False]
+
+
+def test_free_floor_looks_at_every_block_that_matters(rng: np.random.Generator) -> None:
+    corners = rng.uniform(0, 20, (300, 2))
+    plan = empty((20.0, 20.0), [(x, y, x + 0.5, y + 0.3) for x, y in corners])
+    spots = rng.uniform(0.4, 19.6, (2000, 2))
+    gaps = np.maximum(np.maximum(corners - spots[:, None], spots[:, None] - corners - [0.5, 0.3]), 0.0)
+    expected = np.linalg.norm(gaps, axis=2).min(axis=1) >= 0.4
+    assert np.array_equal(plan.free_floor(spots, 0.4), expected)
+
+
+def test_rays_tell_the_normal_of_what_they_meet_also_of_what_was_added() -> None:
+    boxed = scene("clinic").with_box(
+        Pose.from_components([50.0, 0.0, 1.0], Rotation.identity()), (1, 1, 1), rgb=(9, 9, 9)
+    )
+    distance, normal = boxed.trace(
+        [[52.0, 0.0, 1.0], [50.0, 0.0, 3.0], [60.0, 0.0, 1.0]], [[-1, 0, 0], [0, 0, -1], [0, 0, 1]]
+    )
+    assert distance == pytest.approx([1.5, 1.5, np.inf])
+    assert np.allclose(normal, [[1, 0, 0], [0, 0, 1], [0, 0, 0]])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_start_tags_find_bare_walls_all_over_also_inner_ones(name: str, rng: np.random.Generator) -> None:
+    inside = scene(name)
+    graph = tours.largest_part(floor_graph(inside, 0.36))
+    places = staging._bare_walls(inside, graph, rng=rng)
+    at = np.array([p.translation for p in places])
+    x0, y0, x1, y1 = inside.floor_bounds
+    inner = (at[:, 0] > x0 + 0.5) & (at[:, 0] < x1 - 0.5) & (at[:, 1] > y0 + 0.5) & (at[:, 1] < y1 - 0.5)
+    assert len(places) >= 10
+    assert inner.any()
+    for place in places:
+        front = inside.intersect(place.apply([0.1, 0.1, 0.4]), place.rotation.apply([0.0, 0.0, -1.0]))
+        assert front == pytest.approx([0.41], abs=2e-3)
