@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,17 +13,19 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+from numpy.typing import NDArray
 from synthetic_map import CAMERA, as_model, looking, make_map, write_map
 from test_align import walk
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError, StoreError
-from fieldkit.features import extract
+from fieldkit.features import Features, extract
 from fieldkit.frames import Pose, exp, pose_error, pose_from_matrix
 from fieldkit.localize import Localizer
 from fieldkit.maps import MapOptions, build_map, compact_map, content_digest, load_map, map_info
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, landmark_covariance, model_arrays, model_from_arrays
 from fieldkit.maps.pairs import choose_pairs
+from fieldkit.maps.plausible import SlamRules, plausible_matches
 from fieldkit.maps.rigs import write_cameras
 from fieldkit.maps.source import SourceImage, read_source
 from fieldkit.maps.strays import strays
@@ -112,6 +115,28 @@ def test_what_sfm_misplaced_is_told_from_what_slam_misplaced(rng: np.random.Gene
     assert strays(images, misplaced, threshold_m=0.05) == [3, 4, 5]
     jumping = [dataclasses.replace(im, slam_from_cam=slam[i] * leap) if i == 4 else im for i, im in enumerate(images)]
     assert strays(jumping, poses, threshold_m=0.05) == []
+
+
+def matched(places: Sequence[Pose], slam: Sequence[Pose], points: NDArray[np.float64], *, shift_m: float = 0.0) -> int:
+    """Return how many matches SLAM's poses leave when the second camera sees the same thing shifted along x."""
+    images = [SourceImage(f"{i}.jpg", Path(), CAMERA, "", str(i), pose) for i, pose in enumerate(slam)]
+    seen = []
+    for k, place in enumerate(places):
+        pixels, _ = CAMERA.project(place.inv().apply(points + [shift_m * k, 0.0, 0.0]))
+        unused = np.zeros(len(points), np.float32)
+        seen.append(Features(pixels.astype(np.float32), unused, unused, np.zeros((len(points), 128), np.float32)))
+    matches = [np.arange(len(points), dtype=np.uint32)[:, None].repeat(2, axis=1)]
+    return len(plausible_matches(images, seen, [(0, 1)], matches, rules=SlamRules())[0])
+
+
+def test_slam_rules_out_the_next_desk_and_keeps_the_same_one_under_drift(rng: np.random.Generator) -> None:
+    places = [looking(np.array([x, 0.0, 1.5]), np.pi / 2) for x in (0.0, 1.6)]
+    drifted = [places[0], places[1] * exp([0.0, 0.02, 0.0, 0.08, 0.0, 0.0])]
+    points = rng.uniform([0.3, 2.5, 1.0], [1.3, 4.0, 2.0], (200, 3))
+    assert matched(places, places, points) == 200
+    assert matched(places, drifted, points) == 200
+    assert matched(places, places, points, shift_m=1.6) < 20
+    assert matched(places, drifted, points, shift_m=1.6) < 20
 
 
 def test_pairs_do_not_depend_on_poses_and_hold_the_neighbours(rng: np.random.Generator) -> None:

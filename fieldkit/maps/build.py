@@ -30,6 +30,7 @@ from fieldkit.maps.io import (
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
 from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
 from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
+from fieldkit.maps.plausible import SlamRules, plausible_matches
 from fieldkit.maps.sfm import reconstruct, threads
 from fieldkit.maps.source import DepthFrame, MapSource, read_source
 from fieldkit.maps.strays import strays
@@ -46,7 +47,7 @@ class MapOptions:
     """Settings of map building; the defaults suit 50..500 images of rooms.
 
     ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
-    Raises MapError when a length or a count is not positive.
+    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. Raises MapError when a length or a count is not positive.
     """
 
     max_keypoints: int = 2048
@@ -57,6 +58,7 @@ class MapOptions:
     min_registered: float = 0.5
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
     scale: Literal["auto", "slam"] = "auto"
+    slam: SlamRules | None = dataclasses.field(default_factory=SlamRules)
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
@@ -106,7 +108,8 @@ def build_map(
 ) -> MapReport:
     """Build a map folder from a rig folder or an image folder: features, SfM, metric frame, landmarks, surface.
 
-    Only images go into SfM; SLAM poses give scale, frame and gravity afterwards, and depth images refine the scale.
+    SfM starts from the images; SLAM poses only rule out matches between places that look alike. They give scale, frame
+    and gravity afterwards, and depth images refine the scale.
     The same source and seed give the same map, whatever the number of processors.
     ``progress(step, done, total)`` is called along the way. Raises MapError when the source is incomplete, too few
     images register, or the poses do not fit, and StoreError when ``out`` is in the way; nothing is left behind.
@@ -119,7 +122,7 @@ def build_map(
     walk = read_source(Path(source))
     features = _extract_all(walk, feature, options, tell)
     clock.lap("extract")
-    pairs, matches = _match_all(walk, features, options, seed, tell)
+    pairs, matches, disbelieved = _match_all(walk, features, options, seed, tell)
     clock.lap("match")
     model = reconstruct(walk.images, features, pairs, matches, seed=seed, progress=tell)
     clock.lap("reconstruct")
@@ -137,7 +140,7 @@ def build_map(
         places = _alignment_entry(alignment), _surface_entry(surface, options)
         write_map_file(folder, MapFile(1, digest, feature, *counts, *places))
     clock.lap("write")
-    found = (*warnings, *left_out, *missing)
+    found = (*disbelieved, *warnings, *left_out, *missing)
     return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, found)
 
 
@@ -163,14 +166,21 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
 
 def _match_all(
     walk: MapSource, features: list[Features], options: MapOptions, seed: int, tell: Progress
-) -> tuple[list[Pair], list[NDArray[np.uint32]]]:
+) -> tuple[list[Pair], list[NDArray[np.uint32]], list[str]]:
+    """Return pairs, their matches without those that SLAM's poses rule out, and a warning where SLAM is not believed."""
     pairs = choose_pairs(
         walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
     )
     matches = match_pairs(
         pairs, features, ratio=options.ratio, progress=lambda n: tell("match", n, len(pairs)), n_threads=threads()
     )
-    return pairs, matches
+    if options.slam is None:
+        return pairs, matches, []
+    plausible = plausible_matches(walk.images, features, pairs, matches, rules=options.slam)
+    share = sum(map(len, plausible)) / max(sum(map(len, matches)), 1)
+    if share < options.slam.least_share:
+        return pairs, matches, [f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"]
+    return pairs, plausible, []
 
 
 def _registered(walk: MapSource, model: pycolmap.Reconstruction, options: MapOptions) -> dict[int, Pose]:
