@@ -47,7 +47,8 @@ class MapOptions:
     """Settings of map building; the defaults suit 50..500 images of rooms.
 
     ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
-    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. Raises MapError when a length or a count is not positive.
+    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches.
+    Raises MapError when a length or a count is not positive.
     """
 
     max_keypoints: int = 2048
@@ -167,7 +168,7 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
 def _match_all(
     walk: MapSource, features: list[Features], options: MapOptions, seed: int, tell: Progress
 ) -> tuple[list[Pair], list[NDArray[np.uint32]], list[str]]:
-    """Return pairs, their matches without those that SLAM's poses rule out, and a warning where SLAM is not believed."""
+    """Return pairs, their matches as far as SLAM's poses allow them, and a warning where SLAM is not believed."""
     pairs = choose_pairs(
         walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
     )
