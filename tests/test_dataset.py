@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -184,6 +185,14 @@ def test_a_folder_of_something_else_or_a_run_at_work_is_refused(tmp_path: Path, 
         fcntl.flock(stream, fcntl.LOCK_EX)
         with pytest.raises(DatasetError, match=r"set: another run is making it"):
             make(whole)
+
+
+def test_a_map_that_is_folded_is_refused_before_anything_is_localized(mapped: Path) -> None:
+    gauge = next(mapped.glob("maps/*.gauge.toml"))
+    gauge.write_text(re.sub(r"rms_m = .*", "rms_m = 2.9", gauge.read_text()))
+    with pytest.raises(DatasetError, match=r"\.map: its cameras lie 2\.90 m \(rms\) off the true ones"):
+        make(mapped)
+    assert not list(mapped.rglob("*.npz"))
 
 
 @pytest.mark.parametrize(

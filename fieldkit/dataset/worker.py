@@ -40,6 +40,8 @@ from fieldkit.store.files import saving
 
 Tell = Callable[[str, int, int], None]
 WORK_FOLDER = ".work"
+# A map's cameras may lie off the true ones (rms) by this share of the bound within which a view counts as localized.
+MOST_WARP = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +145,7 @@ class Desk:
         # Asked before the map is made, which takes minutes.
         _refuse_other(out, name, mapping_key=key, views_key=self._key)
         gauge = build_scene_map(self._source, folder, rules, tell)
+        _refuse_folded(folder, gauge, rules)
         scene_map = maps.load_map(folder)
         self._studio = Studio(self._source, scene_map, gauge, rules)
         entry = SceneFile(1, name, key, self._key, folder.name, scene_map.digest, tuple(self._waypoints))
@@ -177,6 +180,17 @@ def _refuse_other(out: Path, name: str, **keys: str) -> None:
         raise DatasetError(
             f"{out / name}: was made from another version of the scene {name!r}; expected the same scene and program",
             hint="give --force to make it again (maps that still fit are kept), or choose another --out",
+        )
+
+
+def _refuse_folded(folder: Path, gauge: maps.Gauge, rules: DatasetRules) -> None:
+    """Raise DatasetError for a map so far from the world that its labels would tell about the map, not the views."""
+    most_m = MOST_WARP * rules.label.position_m
+    if gauge.rms_m > most_m:
+        raise DatasetError(
+            f"{folder}: its cameras lie {gauge.rms_m:.2f} m (rms) off the true ones after a rigid fit, up to "
+            f"{gauge.max_m:.2f} m; expected at most {most_m:.2f} m rms: places that look alike may be one in it",
+            hint="make the scene's places differ more, or map it from more places",
         )
 
 
