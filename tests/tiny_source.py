@@ -64,8 +64,8 @@ class TinySource:
         true = {}
         for part in ("images", "depth"):
             (folder / part).mkdir()
-        for k in range(24):
-            angle = 2 * np.pi * k / 24
+        for k in range(16):
+            angle = 2 * np.pi * k / 16
             world_from_cam = aim([np.cos(angle), 0.7 * np.sin(angle), 1.2], angle + np.pi - 0.3)
             seen = render(self._scene, CAMERA, world_from_cam, samples=1)
             cv2.imwrite(str(folder / "images" / f"{k:02d}.png"), cv2.cvtColor(seen.rgb, cv2.COLOR_RGB2GRAY))
