@@ -16,7 +16,7 @@ from fieldkit.bags.writing import BagFormat
 from fieldkit.errors import FieldkitError
 
 if TYPE_CHECKING:
-    from sim_bridge.dataset import Progress
+    from fieldkit.dataset import Progress
 
 # The simulator itself is imported inside the command: --help must not wait for a compiler.
 
@@ -109,6 +109,8 @@ def dataset(
     changes: str = "standard",
     repeats: int = 0,
     repeat_share: float = 0.1,
+    unit: Literal["m", "cm", "mm"] | None = None,
+    up: Literal["z", "y"] | None = None,
     force: bool = False,
 ) -> None:
     """Make a dataset: many views of scenes, localized in maps of them; features and labels are stored, no images.
@@ -116,7 +118,7 @@ def dataset(
     A killed run goes on with the same command. Replay it with `fieldkit replay OUT --protocol paper_sim --out RUN`.
 
     Args:
-        scenes: names of scenes
+        scenes: names of scenes, or meshes of buildings: .glb, .obj or .ply files
         out: dataset folder to write, or to go on with
         seed: the same seed gives the same bytes
         waypoints: places per scene
@@ -126,11 +128,15 @@ def dataset(
         changes: what changes between mapping and robot: standard, none, or a changes.toml
         repeats: further localizations with new noise, of a share of the views
         repeat_share: share of the views that are localized again
+        unit: unit of the meshes; by default they have to look like metres
+        up: axis of the meshes that points up; by default it has to look like z
         force: make the views again where settings differ; maps that still fit are kept
     """
     from sim_bridge.dataset import DatasetOptions, make_scenes
+    from sim_bridge.importing import MeshOptions
 
-    options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share)
+    mesh = MeshOptions(up=up, unit=unit)
+    options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh)
     made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())
     for row in made:
         again = "" if not row.repeats else f", {row.repeats} repeats: {100 * row.flipped:.1f} % change the label"

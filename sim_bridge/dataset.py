@@ -28,6 +28,7 @@ from fieldkit.store import digest, write_rig, write_tum
 from fieldkit.types import Array, Image
 from sim_bridge import robot
 from sim_bridge.errors import SynthesisError
+from sim_bridge.importing import MeshOptions, import_scene, is_mesh
 from sim_bridge.mapping import mapper
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
@@ -86,7 +87,7 @@ class SceneSource:
     options: SceneOptions
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"name": self.name, "options": self.options}
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -99,13 +100,22 @@ class SceneSource:
     def _scene(self) -> Scene:
         return visited_scene(self._blueprint, self.options.changes, seed=self.options.seed)
 
+    def _mapped(self) -> Scene:
+        return mapped_scene(self._blueprint, seed=self.options.seed)
+
+    def _shape(self) -> Scene:
+        return unlit(self._blueprint)
+
+    def _digest(self) -> str:
+        return blueprint_digest(self._blueprint)
+
     @functools.cached_property
     def _lookouts(self) -> tuple[Lookout, ...]:
         return find_lookouts(self._scene, self.options.lookouts, rng=_generator(self.options.seed, 21))
 
     @functools.cached_property
     def _stations(self) -> tuple[mapper.Station, ...]:
-        return mapper.walk(unlit(self._blueprint), self.options.walk, rng=_generator(self.options.seed, 1))
+        return mapper.walk(self._shape(), self.options.walk, rng=_generator(self.options.seed, 1))
 
     @functools.cached_property
     def mapping_key(self) -> str:
@@ -115,7 +125,7 @@ class SceneSource:
         places = [
             s.world_from_rig.as_matrix().tobytes() + s.slam_from_rig.as_matrix().tobytes() for s in self._stations
         ]
-        return digest(blueprint_digest(self._blueprint), repr((MAPPING_VERSION, o.seed, o.walk, sensors)), *places)
+        return digest(self._digest(), repr((MAPPING_VERSION, o.seed, o.walk, sensors)), *places)
 
     @functools.cached_property
     def views_key(self) -> str:
@@ -128,7 +138,7 @@ class SceneSource:
     def write_mapping(self, folder: Path) -> Mapping[str, Pose]:
         """Write the mapping walk through the scene as it was; return world_from_cam by image name."""
         sensors, seed, stations = self.options.sensors, self.options.seed, self._stations
-        scene = mapped_scene(self._blueprint, seed=seed)
+        scene = self._mapped()
         write_rig(folder / "rig.toml", mapper.hololens_rig(sensors.mapping))
         write_tum(folder / "slam_poses.txt", [(s.frame, s.slam_from_rig) for s in stations])
         true = {}
@@ -181,8 +191,32 @@ class SceneSource:
 
 
 @dataclasses.dataclass(frozen=True)
+class MeshSource(SceneSource):
+    """A mesh of one's own as a view source; nothing changes in it between the mapping walk and the visit."""
+
+    path: str
+    mesh: MeshOptions
+
+    @functools.cached_property
+    def _scene(self) -> Scene:
+        return import_scene(Path(self.path), self.mesh)
+
+    def _mapped(self) -> Scene:
+        return self._scene
+
+    def _shape(self) -> Scene:
+        return self._scene
+
+    def _digest(self) -> str:
+        return scene_digest(self._scene)
+
+
+@dataclasses.dataclass(frozen=True)
 class DatasetOptions:
-    """What is asked for of every scene: places, directions, sensors and changes by name or file, and repeats."""
+    """What is asked for of every scene: places, directions, sensors and changes by name or file, and repeats.
+
+    ``mesh`` says how the meshes among the scenes are to be read.
+    """
 
     seed: int = 0
     waypoints: int = 100
@@ -191,6 +225,7 @@ class DatasetOptions:
     changes: str = "standard"
     repeats: int = 0
     repeat_share: float = 0.1
+    mesh: MeshOptions = dataclasses.field(default_factory=MeshOptions)
 
 
 def make_scenes(
@@ -202,7 +237,7 @@ def make_scenes(
     force: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> tuple[SceneCount, ...]:
-    """Make a dataset of scenes by name, or go on with it, and count what it holds.
+    """Make a dataset of scenes by name or path of a mesh, or go on with it, and count what it holds.
 
     Raises SynthesisError for an unknown scene or a number out of range, and what `make_dataset` raises.
     """
@@ -215,8 +250,10 @@ def make_scenes(
     if not 0.0 < options.repeat_share <= 1.0:
         raise SynthesisError(f"--repeat-share {options.repeat_share:g}: expected more than 0, at most 1")
     for name in scenes:
-        if name not in SCENES:
+        if not is_mesh(name) and name not in SCENES:
             raise SynthesisError(f"unknown scene {name!r}", hint=suggestion(name, list(SCENES)))
+        if is_mesh(name) and not Path(name).is_file():
+            raise SynthesisError(f"{name}: no such file; expected a mesh", hint="check the path")
     chosen = SceneOptions(
         seed=options.seed,
         lookouts=LookoutOptions(count=options.waypoints, views=options.views),
@@ -225,7 +262,7 @@ def make_scenes(
     )
     rules = DatasetRules(repeats=options.repeats, repeat_share=options.repeat_share)
     make_dataset(
-        [SceneSource(name, chosen) for name in scenes],
+        [_source(name, chosen, options.mesh) for name in scenes],
         out,
         described=json.loads(json.dumps(dataclasses.asdict(chosen), default=msgspec.to_builtins)),
         rules=rules,
@@ -234,6 +271,12 @@ def make_scenes(
         progress=progress,
     )
     return count_scenes(out)
+
+
+def _source(name: str, options: SceneOptions, mesh: MeshOptions) -> SceneSource:
+    if is_mesh(name):
+        return MeshSource(Path(name).stem, dataclasses.replace(options, changes=None), name, mesh)
+    return SceneSource(name, options)
 
 
 def blueprint_digest(blueprint: Blueprint) -> str:

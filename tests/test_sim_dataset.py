@@ -9,13 +9,15 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import trimesh
 
 from fieldkit.errors import FieldkitError
 from fieldkit.frames import log, pose_error
 from fieldkit.maps.source import read_source
 from sim_bridge.cli import main
-from sim_bridge.dataset import DatasetOptions, SceneOptions, SceneSource, make_scenes
+from sim_bridge.dataset import DatasetOptions, MeshSource, SceneOptions, SceneSource, make_scenes
 from sim_bridge.errors import SynthesisError
+from sim_bridge.importing import MeshOptions
 from sim_bridge.mapping.mapper import WalkOptions
 from sim_bridge.mesh import Scene
 from sim_bridge.robot import ARM_CAMERA, STOWED
@@ -144,6 +146,26 @@ def test_the_mapping_is_a_source_of_map_build(tmp_path: Path) -> None:
     assert len(walk.depth) == 2
 
 
+def test_a_mesh_is_a_source_whose_keys_follow_its_content(tmp_path: Path) -> None:
+    keys = []
+    for shade in (90, 140, 90):
+        hall = trimesh.creation.box((6.0, 5.0, 2.8))
+        hall.visual.face_colors = (shade, 120, 160, 255)
+        hall.export(tmp_path / "hall.ply")
+        source = MeshSource("hall", CALM, str(tmp_path / "hall.ply"), MeshOptions())
+        keys.append((source.mapping_key, source.views_key))
+    assert keys[0] == keys[2]
+    assert not set(keys[0]) & set(keys[1])
+    fresh = pickle.loads(pickle.dumps(source))
+    assert "_scene" not in vars(fresh)
+    waypoints = fresh.waypoints()
+    assert len(waypoints) == OPTIONS.lookouts.count
+    shot = fresh.shoot(waypoints[0], waypoints[0].views[0])
+    assert np.array_equal(source.shoot(waypoints[0], waypoints[0].views[0]), shot)
+    # Walls in the mesh's own colour, whatever the exposure makes of it.
+    assert shot[..., 2].mean() > shot[..., 0].mean() + 15
+
+
 @pytest.mark.parametrize(
     ("scenes", "options", "message"),
     [
@@ -153,6 +175,7 @@ def test_the_mapping_is_a_source_of_map_build(tmp_path: Path) -> None:
         (["room"], DatasetOptions(changes="some"), r"unknown changes 'some'"),
         (["room"], DatasetOptions(repeat_share=0.0), r"--repeat-share 0: expected more than 0"),
         (["room", "room"], DatasetOptions(), r"scenes are room, room; expected each once"),
+        (["gone.glb"], DatasetOptions(), r"gone.glb: no such file; expected a mesh"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

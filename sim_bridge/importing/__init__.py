@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sim_bridge.errors import SynthesisError
 from sim_bridge.importing.colours import paint
 from sim_bridge.importing.floor import ROBOT_RADIUS_M, SMALLEST_M2, Floor, find_floor
-from sim_bridge.importing.reading import SUFFIXES, Part, read_parts
+from sim_bridge.importing.reading import Part, read_parts
 from sim_bridge.mesh import Scene
 
 __all__ = ["Axis", "MeshOptions", "Unit", "import_scene", "is_mesh"]
@@ -61,6 +61,7 @@ def import_scene(path: Path, options: MeshOptions | None = None) -> Scene:
     _check_size(path, bounds[1] - bounds[0], chosen)
     if chosen.up == "y":
         parts = [dataclasses.replace(p, vertices=_raised(p.vertices)) for p in parts]
+    parts = _near_zero(path, parts)
     _warn_of_missing(path, parts)
     painted = paint(parts)
     scene = Scene(
@@ -133,6 +134,15 @@ def _bounds(parts: Sequence[Part]) -> Array:
     """Return the lowest and highest corner f64[2,3] of what faces use."""
     used = [p.vertices[np.unique(p.faces)] for p in parts]
     return np.stack([np.min([v.min(axis=0) for v in used], axis=0), np.max([v.max(axis=0) for v in used], axis=0)])
+
+
+def _near_zero(path: Path, parts: list[Part]) -> list[Part]:
+    """Return parts whose coordinates keep their digits in single precision: a mesh far from zero is moved there."""
+    middle = np.rint(_bounds(parts).mean(axis=0))
+    if np.abs(middle).max() < FAR_M:
+        return parts
+    _log.info("%s: moved by (%.0f, %.0f, %.0f) m to where coordinates are small", path, *-middle)
+    return [dataclasses.replace(p, vertices=p.vertices - middle) for p in parts]
 
 
 def _check_size(path: Path, size: Array, options: MeshOptions) -> None:

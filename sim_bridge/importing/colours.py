@@ -78,7 +78,7 @@ class _Palette:
 
     def number(self, image: Rgb) -> int:
         """Return the number of an image."""
-        key = hashlib.blake2b(np.ascontiguousarray(image)).digest() + repr(image.shape).encode()
+        key = hashlib.blake2b(image.tobytes()).digest() + repr(image.shape).encode()
         if key not in self._known:
             self._known[key] = len(self.textures)
             self.textures.append(image)
@@ -159,7 +159,8 @@ def all_hues() -> Rgb:
     share = np.arange(HUES) / (HUES - 1)
     red, green = np.broadcast_arrays(share[None, :], share[:, None])
     rgb = np.stack([red, green, np.maximum(1.0 - red - green, 0.0)], axis=2)
-    return np.rint(255.0 * rgb / rgb.max(axis=2, keepdims=True)).astype(np.uint8)
+    hues: Rgb = np.rint(255.0 * rgb / rgb.max(axis=2, keepdims=True)).astype(np.uint8)
+    return hues
 
 
 def hue_and_brightness(rgb: Rgb) -> tuple[Array, Array]:

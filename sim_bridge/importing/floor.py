@@ -107,7 +107,7 @@ class _Plan:
         _mark(lying, (level_m - SAG_M, level_m + SILL_M), origin, CELL_M, floor)
         _mark(corners, (level_m + SILL_M, level_m + HEAD_M), origin, CELL_M, taken)
         # A scan has holes where nobody looked.
-        floor |= np.asarray(binary_closing(np.pad(floor, 3), np.ones((3, 3)), iterations=3))[3:-3, 3:-3]
+        floor |= np.asarray(binary_closing(np.pad(floor, 3), np.ones((3, 3), np.bool_), iterations=3))[3:-3, 3:-3]
         return cls(level_m, origin, floor & ~taken)
 
     def floor(self, walls: Scene | None) -> Floor:
@@ -163,9 +163,7 @@ def _room(free: Mask) -> Array:
 
 
 @kernel
-def _mark(
-    corners: Array, between: tuple[float, float], origin: tuple[float, float], cell: float, marked: Mask
-) -> None:
+def _mark(corners: Array, between: tuple[float, float], origin: tuple[float, float], cell: float, marked: Mask) -> None:
     """Mark the cells over which triangles f64[m,3,3] lie, as far as they are between two heights.
 
     A triangle is clipped at the heights; what is left touches a cell unless a side of either separates them.

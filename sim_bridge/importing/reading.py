@@ -196,4 +196,5 @@ def _pixels(picture: Any) -> Rgb | None:
 def _tinted(image: Rgb, factor: tuple[float, float, float] | None) -> Rgb:
     if factor is None or min(factor) > 0.999:
         return image
-    return np.rint(image * np.asarray(factor)).astype(np.uint8)
+    tinted: Rgb = np.rint(image * np.asarray(factor)).astype(np.uint8)
+    return tinted
