@@ -18,7 +18,7 @@ from sim_bridge.errors import SynthesisError
 from sim_bridge.importing import MeshOptions, import_scene
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.stage import tours
+from sim_bridge.stage import staging, tours
 
 CAMERA = Camera("PINHOLE", 160, 120, (120.0, 120.0, 80.0, 60.0))
 LENGTH_M, WIDTH_M, HEIGHT_M = 6.0, 5.0, 2.8
@@ -210,6 +210,35 @@ def test_missing_textures_are_grey_and_said_once(tmp_path: Path, caplog: pytest.
     wall = looking_north(scene)[20:80, 20:140]
     assert np.ptp(wall) == 0
     assert 100 < wall.mean() < 200
+
+
+def test_the_start_tag_hangs_on_the_rough_wall_of_a_scan(tmp_path: Path, rng: np.random.Generator) -> None:
+    scan = trimesh.util.concatenate(coloured(shell(), (120, 140, 90)))
+    scan = scan.subdivide_to_size(0.15)
+    scan.vertices += rng.normal(0.0, 0.0015, scan.vertices.shape)
+    scan.visual = trimesh.visual.ColorVisuals(scan, vertex_colors=rng.integers(0, 255, (len(scan.vertices), 3)))
+    scan.export(tmp_path / "scan.ply")
+    scene = import_scene(tmp_path / "scan.ply")
+    stage = staging.set_stage(scene, staging.StageOptions(waypoints=0, start_places=1), rng=rng)
+    x, y, _ = stage.start_tag.world_from_tag.translation
+    assert 0.005 < min(x, y, LENGTH_M - x, WIDTH_M - y) < 0.025
+    normal = stage.start_tag.world_from_tag.rotation.apply([0.0, 0.0, 1.0])
+    assert max(np.abs(normal)) > np.cos(np.radians(2.0))
+    in_front = stage.start_tag.world_from_tag.apply([0.0, 0.0, 0.005])
+    half = 0.06
+    corners = [[u, v, 0.003] for u in (-half, half) for v in (-half, half)]
+    rays = stage.start_tag.world_from_tag.apply(corners) - in_front
+    assert (scene.intersect(in_front, rays) > np.linalg.norm(rays, axis=1)).all()
+
+
+def test_a_mesh_far_from_zero_is_moved_there(tmp_path: Path) -> None:
+    parts = painted(shell())
+    for part in parts:
+        part.apply_translation((250_000.0, -4_000_000.0, 312.0))
+    scene = import_scene(saved(tmp_path / "grid.obj", parts))
+    assert np.abs(scene.bounds).max() < 10.0
+    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-3)
+    assert 15.0 < 25.0 * scene.free_floor(np.random.default_rng(0).uniform(-2.5, 2.5, (500, 2)), 0.2).mean() <= 25.0
 
 
 def test_a_floor_narrower_than_the_robot_is_refused(tmp_path: Path) -> None:

@@ -27,6 +27,8 @@ FAMILY = "tag36h11"
 # White margin around the black square, in cells of the tag (the square has 8), and the board that carries the print.
 MARGIN_CELLS = 1
 BOARD_M, BOARD_THICKNESS_M, POLE_M = 0.19, 0.006, 0.025
+# A wall of a scan is flat to so much either way.
+ROUGH_M = 0.01
 # Places on the floor from which walls are looked for.
 WALL_SPOTS = 400
 # A quick look that tells how much there is to see around a tag.
@@ -197,7 +199,8 @@ def _place_start(scene: Scene, options: StageOptions, *, rng: np.random.Generato
 def _bare_walls(scene: Scene, graph: FloorGraph, *, rng: np.random.Generator) -> list[Pose]:
     """Return world_from_tag of places at 0.5..0.8 m height where the wall is flat, free, and a tag fits; shuffled.
 
-    Walls are what rays from the free floor meet within reach of the robot. A wall is taller than furniture.
+    Walls are what rays from the free floor meet within reach of the robot. A wall is taller than furniture. Where
+    no wall is quite flat, as in a scan, one that is nearly flat will do.
     """
     spots = graph.centres[rng.permutation(len(graph.centres))[:WALL_SPOTS]]
     yaws = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
@@ -205,30 +208,58 @@ def _bare_walls(scene: Scene, graph: FloorGraph, *, rng: np.random.Generator) ->
     origins = np.repeat(eyes, len(yaws), axis=0)
     rays = np.tile(np.column_stack([np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)]), (len(spots), 1))
     distance, normal = scene.trace(origins, rays)
-    upright = (np.abs(normal[:, 2]) < 0.02) & ((normal * rays).sum(axis=1) < -0.5)
-    near = np.flatnonzero(upright & (distance > 0.4) & (distance < 1.6))
-    found = origins[near] + distance[near, None] * rays[near]
-    # One place per square of 15 cm is enough.
-    _, first = np.unique(np.floor(found[:, :2] / 0.15), axis=0, return_index=True)
-    places = []
-    for k in rng.permutation(first):
-        x, y, _ = normal[near[k]]
-        place = facing(found[k] + 0.01 * normal[near[k]], float(np.arctan2(y, x)))
-        if _is_wall(scene, place):
-            places.append(place)
-    return places
+    in_reach = ((normal * rays).sum(axis=1) < -0.5) & (distance > 0.4) & (distance < 1.6)
+    for leaning, rough_m in ((0.02, 0.0), (0.35, ROUGH_M)):
+        near = np.flatnonzero(in_reach & (np.abs(normal[:, 2]) < leaning))
+        found = origins[near] + distance[near, None] * rays[near]
+        # One place per square of 15 cm is enough.
+        _, first = np.unique(np.floor(found[:, :2] / 0.15), axis=0, return_index=True)
+        places = []
+        for k in rng.permutation(first):
+            x, y, _ = normal[near[k]]
+            place: Pose | None = facing(found[k] + 0.01 * normal[near[k]], float(np.arctan2(y, x)))
+            if place is not None and rough_m:
+                place = _before_plane(scene, place, rough_m)
+            if place is not None and _is_wall(scene, place, rough_m=rough_m):
+                places.append(place)
+        if places:
+            return places
+    return []
 
 
-def _is_wall(scene: Scene, world_from_tag: Pose) -> bool:
-    """Return whether a tag's surroundings are flat, and the surface behind it goes on to above a head's height."""
+def _around() -> Array:
     offsets = np.linspace(-0.13, 0.13, 7)
-    around = np.array([[x, y, 0.4] for x in offsets for y in offsets])
+    return np.array([[x, y, 0.4] for x in offsets for y in offsets])
+
+
+def _before_plane(scene: Scene, world_from_tag: Pose, rough_m: float) -> Pose | None:
+    """Return the pose turned to face the plane that fits the surface behind it best, in front of all of that surface.
+
+    None where the surface is not upright or not as flat as that.
+    """
+    around = _around()
+    back = world_from_tag.rotation.apply([0.0, 0.0, -1.0])
+    height = 0.4 - scene.intersect(world_from_tag.apply(around), back)
+    if not np.isfinite(height).all():
+        return None
+    columns = np.column_stack([around[:, :2], np.ones(len(around))])
+    plane = np.linalg.lstsq(columns, height, rcond=None)[0]
+    off = height - columns @ plane
+    if np.abs(off).max() > rough_m or abs(plane[1]) > 0.03:
+        return None
+    x, y, _ = world_from_tag.rotation.apply([-plane[0], 0.0, 1.0])
+    return facing(world_from_tag.apply([0.0, 0.0, plane[2] + off.max() + 0.01]), float(np.arctan2(y, x)))
+
+
+def _is_wall(scene: Scene, world_from_tag: Pose, *, rough_m: float) -> bool:
+    """Return whether a tag's surroundings are flat, and the surface behind it goes on to above a head's height."""
+    around = _around()
     floor = -float(world_from_tag.translation[2])
     above = np.array([[x, floor + z, 0.4] for x in (-0.1, 0.1) for z in (0.3, 1.1, 1.5, 1.8)])
     back = world_from_tag.rotation.apply([0.0, 0.0, -1.0])
     depth = scene.intersect(world_from_tag.apply(np.vstack([around, above])), back)
     # Rays that miss the wall have no depth; pictures and door frames stand out from it a little.
-    flat = np.abs(depth[: len(around)] - 0.41) < 1e-3
+    flat = np.abs(depth[: len(around)] - (0.41 + rough_m)) < 1e-3 + rough_m
     return bool(flat.all() and (np.abs(depth[len(around) :] - 0.41) < 0.06).all())
 
 
