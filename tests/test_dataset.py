@@ -187,6 +187,13 @@ def test_a_folder_of_something_else_or_a_run_at_work_is_refused(tmp_path: Path, 
             make(whole)
 
 
+@pytest.mark.parametrize("name", ["maps", "../up", ".hidden", ""])
+def test_a_scene_is_not_named_like_something_else(name: str, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"cannot name a folder of the dataset"):
+        make(tmp_path / "set", dataclasses.replace(SOURCE, name=name))
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_map_that_is_folded_is_refused_before_anything_is_localized(mapped: Path) -> None:
     gauge = next(mapped.glob("maps/*.gauge.toml"))
     gauge.write_text(re.sub(r"rms_m = .*", "rms_m = 2.9", gauge.read_text()))

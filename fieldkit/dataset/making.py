@@ -8,6 +8,7 @@ import fcntl
 import multiprocessing
 import os
 import pickle
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -92,6 +93,9 @@ def make_dataset(
     names = [s.name for s in sources]
     if not names or len(set(names)) < len(names):
         raise DatasetError(f"scenes are {', '.join(names) or 'none'}; expected each once", hint="name a scene once")
+    for name in names:
+        if not re.fullmatch(r"\w[\w.-]*", name) or name == MAPS_FOLDER:
+            raise DatasetError(f"scene {name!r}: cannot name a folder of the dataset", hint="give it another name")
     if workers < 1:
         raise DatasetError(f"{workers} workers; expected at least 1", hint="choose another number")
     with _own(out):
