@@ -94,7 +94,7 @@ def _on_floor(path: Path, scene: Scene, floor: Floor | None) -> Scene:
     low, high = scene.bounds
     size = " x ".join(f"{s:.2f}" for s in high - low)
     _log.info(
-        "%s: %d faces, %s m, floor at z = %.2f m with %.0f m2 free", path, len(scene.faces), size, floor.level_m,
+        "%s: %d faces, %s m, floor at z = %.2f m with %.0f m2 free", path, len(scene.faces), size, round(floor.level_m, 2) + 0.0,
         floor.free_m2,
     )  # fmt: skip
     return dataclasses.replace(
