@@ -37,7 +37,7 @@ KITCHEN_X, CORRIDOR_Y, ROOMS_Y = 11.4, 6.2, 7.7
 _PX_PER_M, _FLOOR_PX_PER_M = 110, 120
 _DOWN = Rotation.from_euler("x", np.pi)
 # The share of a stretch of wall that prints cover.
-_HUNG_SHARE = 0.62
+_HUNG_SHARE = 0.78
 _WINDOW_POWER, _LAMP_POWER = 3.0, 4.2
 
 
@@ -243,7 +243,7 @@ def _open_plan(build: Builder, rng: np.random.Generator, look: Style) -> None:
     size = (1.1, 0.62)
     image = textures.screen(rng, px(size))
     hang(build, on_wall(KITCHEN.left(1.3), 0.0, 1.5, off_m=0.03), size, image, name="television")
-    for x, y, yaw in ((3.97, 1.6, 0.0), (7.4, 4.0, 0.0), (2.1, 5.4, np.pi / 2)):
+    for x, y, yaw in ((3.97, 1.6, 0.0), (7.4, 4.0, 0.0), (2.1, 5.4, np.pi / 2), (10.6, 3.4, np.pi / 2)):
         furniture.hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw), ceiling_m=HEIGHT_M)
     for x, y in ((10.95, 0.5), (0.5, 5.7)):
         furniture.plant(build, rng, yaw_pose([x, y, 0.0], float(rng.uniform(0, np.pi))))
