@@ -93,10 +93,9 @@ def _on_floor(path: Path, scene: Scene, floor: Floor | None) -> Scene:
         )
     low, high = scene.bounds
     size = " x ".join(f"{s:.2f}" for s in high - low)
-    _log.info(
-        "%s: %d faces, %s m, floor at z = %.2f m with %.0f m2 free", path, len(scene.faces), size, round(floor.level_m, 2) + 0.0,
-        floor.free_m2,
-    )  # fmt: skip
+    # Zero has no sign.
+    where = f"floor at z = {round(floor.level_m, 2) + 0.0:.2f} m with {floor.free_m2:.0f} m2 free"
+    _log.info("%s: %d faces, %s m, %s", path, len(scene.faces), size, where)
     return dataclasses.replace(
         scene,
         vertices=scene.vertices - [0.0, 0.0, floor.level_m],
