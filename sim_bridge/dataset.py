@@ -40,7 +40,7 @@ from sim_bridge.sensors import STANDARD, Motion, Sensors, bent, encode, expose, 
 from sim_bridge.stage.lookouts import Lookout, LookoutOptions, find_lookouts
 
 # Raised when the same blueprint and options give other mapping images, or other views, than before.
-MAPPING_VERSION, VIEWS_VERSION = 4, 1
+MAPPING_VERSION, VIEWS_VERSION = 5, 1
 
 
 @dataclasses.dataclass(frozen=True)

@@ -139,6 +139,12 @@ def test_slam_rules_out_the_next_desk_and_keeps_the_same_one_under_drift(rng: np
     assert matched(places, drifted, points, shift_m=1.6) < 20
 
 
+def test_slam_rules_out_the_shelf_opposite_that_looks_the_same() -> None:
+    facing = [looking(np.array([0.0, 0.0, 1.5]), np.pi / 2), looking(np.array([0.0, 4.0, 1.5]), -np.pi / 2)]
+    between = np.array([[x, 2.0, z] for x in (-0.5, 0.0, 0.5) for z in (1.0, 1.5, 2.0)])
+    assert matched(facing, facing, between) == 0
+
+
 def test_pairs_do_not_depend_on_poses_and_hold_the_neighbours(rng: np.random.Generator) -> None:
     images, _ = rig_images(rng)
     features = [extract(rng.integers(0, 255, size=(64, 64)).astype(np.uint8), max_keypoints=20) for _ in images]

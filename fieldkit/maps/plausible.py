@@ -20,8 +20,9 @@ class SlamRules:
     """How far SLAM's relative poses are trusted: generously, they only have to tell one desk from the next.
 
     ``rotation_deg`` and ``position_m`` are the errors allowed between two images, the latter growing by
-    ``drift_per_m`` of the way walked in between; points lie ``nearest_m`` to ``farthest_m`` away. Poses that fit less
-    than ``least_share`` of all matches are wrong themselves and rule out nothing.
+    ``drift_per_m`` of the way walked in between; points lie ``nearest_m`` to ``farthest_m`` away, and nothing looks
+    the same from directions more than ``widest_deg`` apart: opposite shelves do. Poses that fit less than
+    ``least_share`` of all matches are wrong themselves and rule out nothing.
     """
 
     rotation_deg: float = 3.0
@@ -29,6 +30,7 @@ class SlamRules:
     drift_per_m: float = 0.005
     nearest_m: float = 0.2
     farthest_m: float = 15.0
+    widest_deg: float = 60.0
     least_share: float = 0.5
 
 
@@ -62,11 +64,12 @@ def plausible_matches(
 def _meet(x: Array, y: Array, step: Array, error_m: float, rules: SlamRules) -> NDArray[np.bool_]:
     """Return bool[k]: whether unit rays x (k, 3) from the origin and y (k, 3) from ``step`` (3,) can meet.
 
-    The point on x at each of a few depths is looked at from ``step``: the smallest angle to y must lie within the
-    rotation's error plus the angle under which the position's error is seen from there.
+    Rays too far apart do not. The point on x at each of a few depths is looked at from ``step``: the smallest angle
+    to y must lie within the rotation's error plus the angle under which the position's error is seen from there.
     """
     depths = np.geomspace(rules.nearest_m, rules.farthest_m, 24)
     allowed = np.zeros(len(x), dtype=bool)
+    narrow = (x * y).sum(axis=1) >= np.cos(np.radians(rules.widest_deg))
     for depth in depths:
         towards = depth * x - step
         distance = np.linalg.norm(towards, axis=1)
@@ -76,7 +79,7 @@ def _meet(x: Array, y: Array, step: Array, error_m: float, rules: SlamRules) -> 
         slack = np.radians(rules.rotation_deg) + error_m / np.maximum(distance, rules.nearest_m) + between
         near = distance >= rules.nearest_m
         allowed |= near & (np.arccos(cosine) <= np.minimum(slack, np.pi / 4))
-    return allowed
+    return np.asarray(allowed & narrow)
 
 
 def _unit(vectors: Array) -> Array:
