@@ -32,8 +32,8 @@ LOOP_STEP_M = 0.05
 # A quarter turn counts as a metre and a half of walking.
 METRES_PER_QUARTER_TURN = 1.5
 METRES_PER_STATION = 0.85
-# A tour is walked there and back, with fewer stations each way.
-METRES_PER_TOUR_STATION = 1.85
+# A tour goes along every passage both ways, with fewer stations each way.
+METRES_PER_TOUR_STATION = 1.75
 MOST_STATIONS = 150
 # What 16 bits of millimetres can hold.
 DEPTH_FAR_M = 65.0
@@ -97,7 +97,7 @@ def _mounted(position_m: tuple[float, float, float], yaw_deg: float, *, pitch_de
 def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tuple[Station, ...]:
     """Walk along the scene's loop and return the stations, evenly spaced, with natural bob and turning of the head.
 
-    A scene without a loop of its own is toured through all its free floor, there and back: what is seen from one side
+    A scene without a loop of its own is toured along all its passages, both ways: what is seen from one side
     only does not help who comes from the other, and places that look alike are told apart by what lies around them.
     SLAM's frame starts below the first station, z up.
     """
@@ -146,10 +146,7 @@ def _places(length: int, heading: Array, options: WalkOptions, *, spacing_m: flo
 
 def _smooth_loop(scene: Scene, *, step_m: float) -> tuple[Array, Array]:
     """Return the scene's loop as points (n, 2), rounded as far as the free floor allows, and its heading (n,)."""
-    loop = scene.walk_xy
-    if not len(loop):
-        there = tours.tour(scene)
-        loop = np.concatenate([there, there[::-1]])
+    loop = scene.walk_xy if len(scene.walk_xy) else tours.tour(scene)
     corners = np.vstack([loop, loop[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     count = max(round(along[-1] / step_m), 8)

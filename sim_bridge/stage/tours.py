@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import connected_components
 
 from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Scene
+from sim_bridge.stage.network import walk_network
 from sim_bridge.stage.paths import CELL_M, FloorGraph, floor_graph, spaced
 
 Array = NDArray[np.float64]
@@ -17,28 +18,17 @@ Array = NDArray[np.float64]
 WALKER_RADII_M = (0.36, 0.28, 0.2)
 EYE_M = 1.65
 STEP_M = 0.05
-# The tour passes all free floor within the first of these distances that keeps it shorter than METRES_PER_M2.
-REACHES_M = (1.0, 1.2, 1.4, 1.6, 1.8, 2.2)
-METRES_PER_M2 = 0.55
-# Nooks of free floor smaller than this are seen from outside.
-NOOK_M2 = 0.25
+# The tour passes all free floor within about this distance.
+REACH_M = 1.4
 
 
 def tour(scene: Scene) -> Array:
-    """Return a closed polyline (n, 2) in m, about STEP_M apart, that passes near all connected free floor.
+    """Return a closed polyline (n, 2) in m, about STEP_M apart, along all passages of the free floor, once each way.
 
-    The last point leads to the first. Passages are walked both ways where they are the only way. Raises
-    SynthesisError for a scene without free floor.
+    The last point leads to the first. Raises SynthesisError for a scene without free floor.
     """
     graph, radius_m = walkable(scene)
-    longest = METRES_PER_M2 * shown_area_m2(scene, graph)
-    loop = np.empty((0, 2))
-    for reach_m in REACHES_M:
-        corners = _loop(graph, _stops(graph, reach_m))
-        loop = smoothed_loop(scene, corners, radius_m=radius_m)
-        if _length(loop) <= longest:
-            break
-    return loop
+    return smoothed_loop(scene, walk_network(graph, reach_m=REACH_M), radius_m=radius_m)
 
 
 def walkable(scene: Scene) -> tuple[FloorGraph, float]:
@@ -90,50 +80,6 @@ def shown_area_m2(scene: Scene, graph: FloorGraph) -> float:
     return float(seen.sum()) * cell**2
 
 
-def _stops(graph: FloorGraph, reach_m: float) -> NDArray[np.intp]:
-    """Choose cells such that every cell lies within a walk of ``reach_m`` of one, greedily those that reach most."""
-    # A quarter of the cells is enough to choose from.
-    cells = np.round(graph.centres / CELL_M).astype(int)
-    candidates = np.flatnonzero((cells % 2 == 0).all(axis=1))
-    if not len(candidates):
-        candidates = np.arange(len(cells))
-    reached = []
-    for chunk in np.array_split(candidates, max(1, len(candidates) // 200)):
-        # Steps beside furniture cost up to threefold: there a stop reaches less far, and so lies nearer.
-        cost = dijkstra(graph.steps, directed=False, indices=chunk, limit=1.5 * reach_m)
-        reached += [np.flatnonzero(np.isfinite(row)) for row in cost]
-    open_cells = np.ones(len(cells), np.bool_)
-    gains = np.array([len(r) for r in reached], dtype=np.float64)
-    chosen: list[int] = []
-    while True:
-        # Gains only shrink: the best one that is still up to date is the best of all.
-        best = int(np.argmax(gains))
-        gain = float(open_cells[reached[best]].sum())
-        if gain < gains[best]:
-            gains[best] = gain
-            continue
-        if chosen and gain * CELL_M**2 < NOOK_M2:
-            break
-        chosen.append(best)
-        open_cells[reached[best]] = False
-        gains[best] = 0.0
-    return candidates[chosen]
-
-
-def _loop(graph: FloorGraph, stops: NDArray[np.intp]) -> Array:
-    """Return the cells (n, 2) of a short closed walk through all stops."""
-    cost, previous = dijkstra(graph.steps, directed=False, indices=stops, return_predecessors=True)
-    order = round_trip(cost[:, stops])
-    cells: list[int] = []
-    for k, first in enumerate(order):
-        last = order[(k + 1) % len(order)]
-        way = [int(stops[last])]
-        while way[-1] != stops[first]:
-            way.append(int(previous[first, way[-1]]))
-        cells += way[:0:-1] if len(way) > 1 else way
-    return graph.centres[cells]
-
-
 def round_trip(cost: Array) -> list[int]:
     """Return the order of a short round trip: cheapest insertion, then turning stretches around while it helps."""
     count = len(cost)
@@ -173,7 +119,3 @@ def smoothed_loop(scene: Scene, corners: Array, *, radius_m: float, rounds: int 
         free = scene.free_floor(moved, radius_m)
         path = np.where(free[:, None], moved, path)
     return spaced(np.vstack([path, path[:1]]), STEP_M)[:-1]
-
-
-def _length(loop: Array) -> float:
-    return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
