@@ -283,7 +283,7 @@ def blueprint_digest(blueprint: Blueprint) -> str:
     """Return the digest of everything that a blueprint holds."""
     parts: list[bytes | str] = [repr((blueprint.floor_bounds, blueprint.walk_xy.tolist()))]
     for quad in blueprint.quads:
-        parts.append(quad.corners.tobytes() + quad.normal.tobytes())
+        parts.append(quad.corners.tobytes() + quad.normal.tobytes() + np.asarray(quad.uv).tobytes())
         parts.append(repr((quad.texture, quad.cell_m, quad.solid, quad.closed, quad.glow, quad.thing)))
     for texture in blueprint.textures:
         parts += [repr(texture.shape), np.ascontiguousarray(texture).tobytes()]
