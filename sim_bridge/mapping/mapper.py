@@ -31,10 +31,11 @@ OUTWARDS_DEG = 52.0
 LOOP_STEP_M = 0.05
 # A quarter turn counts as a metre and a half of walking.
 METRES_PER_QUARTER_TURN = 1.5
-METRES_PER_STATION = 0.85
-# A tour goes along every passage both ways, with fewer stations each way.
-METRES_PER_TOUR_STATION = 1.75
-MOST_STATIONS = 150
+# As does the step into another room.
+METRES_PER_NEW_VIEW = 2.0
+# Each station takes four images.
+STATIONS_PER_M2 = 0.8
+LEAST_STATIONS, MOST_STATIONS = 12, 150
 # What 16 bits of millimetres can hold.
 DEPTH_FAR_M = 65.0
 
@@ -43,8 +44,8 @@ DEPTH_FAR_M = 65.0
 class WalkOptions:
     """How the walk is taken and how well the device tracks itself.
 
-    ``stations`` None takes one about every METRES_PER_STATION, fewer on a tour. ``laps`` above 1 repeats the beginning,
-    so that the walk closes. The drift is a random walk per root of metre.
+    ``stations`` None takes STATIONS_PER_M2 of the floor that the walk shows, within limits. ``laps`` above 1 repeats
+    the beginning, so that the walk closes. The drift is a random walk per root of metre.
     """
 
     stations: int | None = None
@@ -103,9 +104,8 @@ def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tup
     """
     path, tangent = _smooth_loop(scene, step_m=LOOP_STEP_M)
     phase = rng.uniform(0.0, 2 * np.pi, 4)
-    spacing_m = METRES_PER_STATION if len(scene.walk_xy) else METRES_PER_TOUR_STATION
-    at, metres = _places(len(path), tangent, options, spacing_m=spacing_m)
-    count = len(at)
+    count = options.stations or _count(scene)
+    at, metres = _places(_change(scene, path, options), tangent, count, laps=options.laps)
     around = np.radians(options.look_around_deg)
     yaw = tangent[at] + around * np.sin(2 * np.pi * metres / 5.3 + phase[0])
     yaw = yaw + np.radians(rng.normal(0.0, 1.5, count))
@@ -127,18 +127,42 @@ def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tup
     )
 
 
-def _places(length: int, heading: Array, options: WalkOptions, *, spacing_m: float) -> tuple[NDArray[np.intp], Array]:
+def _change(scene: Scene, path: Array, options: WalkOptions) -> Array:
+    """Return how much of all around comes into view or goes out of it at each step of a path, f64[n] in 0..1.
+
+    In the middle of a room it is almost nothing; through a doorway it adds up to about one.
+    """
+    if not len(scene.faces):
+        return np.zeros(len(path))
+    angles = np.linspace(0.0, 2 * np.pi, 90, endpoint=False)
+    rays = np.column_stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)])
+    eyes = np.column_stack([path, np.full(len(path), options.height_m)])
+    distance = scene.intersect(np.repeat(eyes, len(rays), axis=0), np.tile(rays, (len(path), 1)))
+    seen = np.log(np.minimum(distance, 20.0)).reshape(len(path), -1)
+    changed = (np.abs(seen - np.roll(seen, 1, axis=0)) > 0.25).mean(axis=1)
+    return gaussian_filter1d(changed, 0.2 / LOOP_STEP_M, mode="wrap")
+
+
+def _count(scene: Scene) -> int:
+    """Return how many stations show all of a floor."""
+    graph, _ = tours.walkable(scene)
+    return min(max(round(STATIONS_PER_M2 * tours.shown_area_m2(scene, graph)), LEAST_STATIONS), MOST_STATIONS)
+
+
+def _places(change: Array, heading: Array, count: int, *, laps: float) -> tuple[NDArray[np.intp], Array]:
     """Return the index on the loop of every station and the metres walked there.
 
-    A quarter turn takes as many stations as a metre and a half: views of neighbours overlap in bends, too.
+    A quarter turn takes as many stations as a metre and a half, and a doorway as many as some metres: views of
+    neighbours overlap in bends and from room to room, too.
     """
-    index = np.arange(int(np.ceil(options.laps * length)) + 1)
-    laps, rest = np.divmod(index, length)
+    length = len(change)
+    index = np.arange(int(np.ceil(laps * length)) + 1)
+    lap, rest = np.divmod(index, length)
     total_turn = heading[-1] - heading[0] + _wrapped(heading[0] - heading[-1])
-    turned = np.abs(np.diff(heading[rest] + laps * total_turn))
+    turned = np.abs(np.diff(heading[rest] + lap * total_turn))
     per_rad = METRES_PER_QUARTER_TURN / (np.pi / 2)
-    effort = np.concatenate([[0.0], np.cumsum(LOOP_STEP_M + turned * per_rad)])
-    count = options.stations or min(max(round(effort[-1] / spacing_m), 12), MOST_STATIONS)
+    step = LOOP_STEP_M + turned * per_rad + change[rest[1:]] * METRES_PER_NEW_VIEW
+    effort = np.concatenate([[0.0], np.cumsum(step)])
     wanted = np.linspace(0.0, effort[-1], count, endpoint=False)
     place = np.searchsorted(effort, wanted)
     return rest[place].astype(np.intp), place.astype(np.float64) * LOOP_STEP_M
