@@ -7,6 +7,7 @@ import functools
 
 import numpy as np
 import pytest
+from empty_floor import empty_floor
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fieldkit.frames import Pose, pose_error
@@ -22,19 +23,7 @@ from sim_bridge.stage.paths import TrackBuilder, floor_graph, headings, plan_pat
 
 def floor(blocks: list[tuple[float, float, float, float]]) -> Scene:
     """A floor of 6 x 4 m with rectangular footprints (x0, y0, x1, y1) and nothing to see."""
-    corners = [[x0, y0, x1, y0, x1, y1, x0, y1] for x0, y0, x1, y1 in blocks]
-    return Scene(
-        vertices=np.zeros((0, 3)),
-        faces=np.zeros((0, 3), np.int32),
-        uv=np.zeros((0, 3, 2), np.float32),
-        texture=np.zeros(0, np.int32),
-        textures=(),
-        closed=np.zeros(0, np.bool_),
-        shade=np.zeros((0, 3), np.float32),
-        blocks=np.array(corners, dtype=np.float64).reshape(-1, 8),
-        walk_xy=np.array([(1, 1), (5, 1), (5, 3), (1, 3)], dtype=np.float64),
-        floor_bounds=(0.0, 0.0, 6.0, 4.0),
-    )
+    return empty_floor((6.0, 4.0), blocks, walk_xy=[(1, 1), (5, 1), (5, 3), (1, 3)])
 
 
 def chain(arm: robot.ArmJoints, names: tuple[str, ...]) -> Pose:

@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 import pytest
+from empty_floor import empty_floor
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -31,26 +32,9 @@ def tour(name: str) -> np.ndarray:
     return tours.tour(scene(name))
 
 
-def empty(size: tuple[float, float], blocks: list[tuple[float, float, float, float]]) -> Scene:
-    """A floor with footprints (x0, y0, x1, y1) and nothing to see."""
-    corners = [[x0, y0, x1, y0, x1, y1, x0, y1] for x0, y0, x1, y1 in blocks]
-    return Scene(
-        vertices=np.zeros((0, 3)),
-        faces=np.zeros((0, 3), np.int32),
-        uv=np.zeros((0, 3, 2), np.float32),
-        texture=np.zeros(0, np.int32),
-        textures=(),
-        closed=np.zeros(0, np.bool_),
-        shade=np.zeros((0, 3), np.float32),
-        blocks=np.array(corners, dtype=np.float64).reshape(-1, 8),
-        walk_xy=np.zeros((0, 2)),
-        floor_bounds=(0.0, 0.0, *size),
-    )
-
-
 def shelves() -> Scene:
     """Four aisles between three shelves, open at both ends."""
-    return empty((8.0, 9.0), [(x, 1.5, x + 0.9, 7.5) for x in (1.3, 3.55, 5.8)])
+    return empty_floor((8.0, 9.0), [(x, 1.5, x + 0.9, 7.5) for x in (1.3, 3.55, 5.8)])
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -103,23 +87,23 @@ def test_stations_of_a_tour_look_both_ways() -> None:
 
 def test_a_tour_goes_through_doors_into_every_room_of_the_connected_floor() -> None:
     # Two rooms with a door in between, and a third without one.
-    plan = empty((9.0, 4.0), [(3.9, 0.0, 4.0, 1.5), (3.9, 2.5, 4.0, 4.0), (7.0, 0.0, 7.1, 4.0)])
+    plan = empty_floor((9.0, 4.0), [(3.9, 0.0, 4.0, 1.5), (3.9, 2.5, 4.0, 4.0), (7.0, 0.0, 7.1, 4.0)])
     loop = tours.tour(plan)
     assert loop[:, 0].min() < 2.0
     assert 5.0 < loop[:, 0].max() < 7.0
 
 
 def test_walkers_make_themselves_narrow_where_they_must() -> None:
-    graph, radius_m = tours.walkable(empty((6.0, 0.8), []))
+    graph, radius_m = tours.walkable(empty_floor((6.0, 0.8), []))
     assert radius_m == 0.28
     assert len(graph.centres) > 20
     with pytest.raises(SynthesisError, match="no free floor"):
-        tours.walkable(empty((6.0, 0.35), []))
+        tours.walkable(empty_floor((6.0, 0.35), []))
 
 
 def test_clearance_narrows_the_floor_like_blocks_do() -> None:
     distance = np.minimum(*np.meshgrid(np.arange(40) * 0.05, np.arange(40) * 0.05, indexing="ij")).astype(np.float32)
-    plan = empty((2.0, 2.0), [(1.5, 1.5, 1.6, 1.6)])
+    plan = empty_floor((2.0, 2.0), [(1.5, 1.5, 1.6, 1.6)])
     limited = Scene(**{**plan.__dict__, "clearance": Clearance(distance, (0.0, 0.0), 0.05)})
     spots = [(1.0, 1.0), (0.35, 1.0), (1.0, 0.35), (1.45, 1.45)]
     assert plan.free_floor(spots, 0.34).tolist() == [True, True, True, False]
@@ -128,7 +112,7 @@ def test_clearance_narrows_the_floor_like_blocks_do() -> None:
 
 def test_free_floor_looks_at_every_block_that_matters(rng: np.random.Generator) -> None:
     corners = rng.uniform(0, 20, (300, 2))
-    plan = empty((20.0, 20.0), [(x, y, x + 0.5, y + 0.3) for x, y in corners])
+    plan = empty_floor((20.0, 20.0), [(x, y, x + 0.5, y + 0.3) for x, y in corners])
     spots = rng.uniform(0.4, 19.6, (2000, 2))
     gaps = np.maximum(np.maximum(corners - spots[:, None], spots[:, None] - corners - [0.5, 0.3]), 0.0)
     expected = np.linalg.norm(gaps, axis=2).min(axis=1) >= 0.4
