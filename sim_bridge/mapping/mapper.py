@@ -44,11 +44,12 @@ DEPTH_FAR_M = 65.0
 class WalkOptions:
     """How the walk is taken and how well the device tracks itself.
 
-    ``stations`` None takes STATIONS_PER_M2 of the floor that the walk shows, within limits. ``laps`` above 1 repeats
-    the beginning, so that the walk closes. The drift is a random walk per root of metre.
+    ``stations`` None takes STATIONS_PER_M2 of the floor that the walk shows, within limits. A tour passes a share
+    ``covers`` of the free floor. ``laps`` above 1 repeats the beginning, so that the walk closes. The drift is a random walk per root of metre.
     """
 
     stations: int | None = None
+    covers: float = 0.8
     laps: float = 1.04
     height_m: float = 1.65
     look_around_deg: float = 15.0
@@ -98,11 +99,10 @@ def _mounted(position_m: tuple[float, float, float], yaw_deg: float, *, pitch_de
 def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tuple[Station, ...]:
     """Walk along the scene's loop and return the stations, evenly spaced, with natural bob and turning of the head.
 
-    A scene without a loop of its own is toured along all its passages, both ways: what is seen from one side
-    only does not help who comes from the other, and places that look alike are told apart by what lies around them.
+    A scene without a loop of its own is toured the short way, each passage once, as a person with little time would.
     SLAM's frame starts below the first station, z up.
     """
-    path, tangent = _smooth_loop(scene, step_m=LOOP_STEP_M)
+    path, tangent = _smooth_loop(scene, step_m=LOOP_STEP_M, covers=options.covers)
     phase = rng.uniform(0.0, 2 * np.pi, 4)
     count = options.stations or _count(scene)
     at, metres = _places(_change(scene, path, options), tangent, count, laps=options.laps)
@@ -168,9 +168,9 @@ def _places(change: Array, heading: Array, count: int, *, laps: float) -> tuple[
     return rest[place].astype(np.intp), place.astype(np.float64) * LOOP_STEP_M
 
 
-def _smooth_loop(scene: Scene, *, step_m: float) -> tuple[Array, Array]:
+def _smooth_loop(scene: Scene, *, step_m: float, covers: float) -> tuple[Array, Array]:
     """Return the scene's loop as points (n, 2), rounded as far as the free floor allows, and its heading (n,)."""
-    loop = scene.walk_xy if len(scene.walk_xy) else tours.tour(scene)
+    loop = scene.walk_xy if len(scene.walk_xy) else tours.tour(scene, covers=covers)
     corners = np.vstack([loop, loop[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     count = max(round(along[-1] / step_m), 8)
