@@ -32,6 +32,10 @@ def tour(name: str) -> np.ndarray:
     return tours.tour(scene(name))
 
 
+def length(loop: np.ndarray) -> float:
+    return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
+
+
 def shelves() -> Scene:
     """Four aisles between three shelves, open at both ends."""
     return empty_floor((8.0, 9.0), [(x, 1.5, x + 0.9, 7.5) for x in (1.3, 3.55, 5.8)])
@@ -53,36 +57,43 @@ def test_a_tour_passes_near_all_free_floor(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_tour_is_about_a_metre_per_square_metre_and_has_three_images_for_each(name: str) -> None:
+def test_a_shorter_tour_leaves_out_dead_ends_and_covers_what_it_promises(name: str) -> None:
+    graph, _ = tours.walkable(scene(name))
+    short = tours.tour(scene(name), covers=0.65)
+    off, _ = cKDTree(short).query(graph.centres)
+    assert (off < 1.5).mean() > 0.6
+    assert off.max() > 2.0
+    assert length(short) < 0.75 * length(tour(name))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_walk_has_four_images_per_square_metre_of_the_floor_that_is_seen(name: str) -> None:
     graph, _ = tours.walkable(scene(name))
     area = tours.shown_area_m2(scene(name), graph)
     stations = mapper.walk(scene(name), mapper.WalkOptions(), rng=np.random.default_rng(0))
-    length = np.linalg.norm(np.roll(tour(name), -1, axis=0) - tour(name), axis=1).sum()
-    assert 0.5 * area < length < 1.2 * area
-    assert 2.3 < 4 * len(stations) / area < 4.0
+    assert 3.5 < 4 * len(stations) / area < 4.5
     assert 4 * len(stations) <= 600
 
 
-def test_a_tour_leads_through_every_passage_both_ways() -> None:
+def test_a_tour_of_all_the_floor_leads_into_every_aisle_once() -> None:
     loop = tours.tour(shelves())
-    ahead = np.roll(loop, -1, axis=0) - loop
     for middle in (0.65, 2.875, 5.125, 7.35):
         in_aisle = (np.abs(loop[:, 0] - middle) < 0.3) & (loop[:, 1] > 2.0) & (loop[:, 1] < 7.0)
-        for sign in (1.0, -1.0):
-            along = loop[in_aisle & (sign * ahead[:, 1] > 0.0), 1]
-            assert len(along)
-            assert along.min() < 2.3
-            assert along.max() > 6.7
-        assert not np.isclose(ahead[in_aisle], 0.0, atol=1e-3).all(axis=1).any()
+        assert np.ptp(loop[in_aisle, 1]) > 4.5
 
 
-def test_stations_of_a_tour_look_both_ways() -> None:
+def test_stations_of_a_walk_look_both_ways_and_turn_around_in_steps() -> None:
     stations = mapper.walk(shelves(), mapper.WalkOptions(stations=70), rng=np.random.default_rng(0))
     at = np.array([s.world_from_rig.translation[:2] for s in stations])
     ahead = np.array([s.world_from_rig.rotation.apply([1.0, 0.0, 0.0])[:2] for s in stations])
     near = np.linalg.norm(at[:, None] - at[None], axis=2) < 0.8
     against = ahead @ ahead.T < -0.7
     assert (near & against).any(axis=1).mean() > 0.6
+    # Neighbours overlap: the cameras together see 170 degrees.
+    turned = np.degrees(np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(axis=1), -1.0, 1.0)))
+    assert turned.max() < 70.0
+    moved = np.linalg.norm(np.diff(at, axis=0), axis=1)
+    assert moved.max() < 2.0
 
 
 def test_a_tour_goes_through_doors_into_every_room_of_the_connected_floor() -> None:

@@ -34,7 +34,7 @@ METRES_PER_QUARTER_TURN = 1.5
 # As does the step into another room.
 METRES_PER_NEW_VIEW = 2.0
 # Each station takes four images.
-STATIONS_PER_M2 = 0.8
+STATIONS_PER_M2 = 1.0
 LEAST_STATIONS, MOST_STATIONS = 12, 150
 # What 16 bits of millimetres can hold.
 DEPTH_FAR_M = 65.0
@@ -44,15 +44,16 @@ DEPTH_FAR_M = 65.0
 class WalkOptions:
     """How the walk is taken and how well the device tracks itself.
 
-    ``stations`` None takes STATIONS_PER_M2 of the floor that the walk shows, within limits. A tour passes a share
-    ``covers`` of the free floor. ``laps`` above 1 repeats the beginning, so that the walk closes. The drift is a random walk per root of metre.
+    ``stations`` None takes STATIONS_PER_M2 of the floor that can be seen, within limits. A tour passes a share
+    ``covers`` of the free floor. ``laps`` above 1 repeats the beginning, so that the walk closes. The drift is a random
+    walk per root of metre.
     """
 
     stations: int | None = None
-    covers: float = 0.8
+    covers: float = 0.65
     laps: float = 1.04
     height_m: float = 1.65
-    look_around_deg: float = 15.0
+    look_around_deg: float = 25.0
     speed_m_s: float = 0.6
     turning_deg_s: float = 12.0
     drift_m: float = 0.005
@@ -99,10 +100,14 @@ def _mounted(position_m: tuple[float, float, float], yaw_deg: float, *, pitch_de
 def walk(scene: Scene, options: WalkOptions, *, rng: np.random.Generator) -> tuple[Station, ...]:
     """Walk along the scene's loop and return the stations, evenly spaced, with natural bob and turning of the head.
 
-    A scene without a loop of its own is toured the short way, each passage once, as a person with little time would.
-    SLAM's frame starts below the first station, z up.
+    A scene without a loop of its own is toured by a short way there and back, as a person with little time would:
+    some floor is never walked on. SLAM's frame starts below the first station, z up.
     """
-    path, tangent = _smooth_loop(scene, step_m=LOOP_STEP_M, covers=options.covers)
+    if len(scene.walk_xy):
+        path, tangent = _smooth_loop(scene, scene.walk_xy, step_m=LOOP_STEP_M)
+    else:
+        loop = tours.tour(scene, covers=options.covers)
+        path, tangent = _and_back(*_smooth_loop(scene, loop, step_m=LOOP_STEP_M))
     phase = rng.uniform(0.0, 2 * np.pi, 4)
     count = options.stations or _count(scene)
     at, metres = _places(_change(scene, path, options), tangent, count, laps=options.laps)
@@ -144,7 +149,7 @@ def _change(scene: Scene, path: Array, options: WalkOptions) -> Array:
 
 
 def _count(scene: Scene) -> int:
-    """Return how many stations show all of a floor."""
+    """Return how many stations a floor of this size is worth."""
     graph, _ = tours.walkable(scene)
     return min(max(round(STATIONS_PER_M2 * tours.shown_area_m2(scene, graph)), LEAST_STATIONS), MOST_STATIONS)
 
@@ -168,9 +173,15 @@ def _places(change: Array, heading: Array, count: int, *, laps: float) -> tuple[
     return rest[place].astype(np.intp), place.astype(np.float64) * LOOP_STEP_M
 
 
-def _smooth_loop(scene: Scene, *, step_m: float, covers: float) -> tuple[Array, Array]:
-    """Return the scene's loop as points (n, 2), rounded as far as the free floor allows, and its heading (n,)."""
-    loop = scene.walk_xy if len(scene.walk_xy) else tours.tour(scene, covers=covers)
+def _and_back(path: Array, heading: Array) -> tuple[Array, Array]:
+    """Return a closed path (n, 2) walked once each way, and the heading (2n,), with a turn on the spot in between."""
+    both = np.concatenate([heading, heading[::-1] + np.pi])
+    # The turns take about a metre, and the second undoes the first.
+    return np.vstack([path, path[::-1]]), gaussian_filter1d(both, 0.5 / LOOP_STEP_M, mode="wrap")
+
+
+def _smooth_loop(scene: Scene, loop: Array, *, step_m: float) -> tuple[Array, Array]:
+    """Return a closed loop as points (n, 2), rounded as far as the free floor allows, and its heading (n,)."""
     corners = np.vstack([loop, loop[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     count = max(round(along[-1] / step_m), 8)

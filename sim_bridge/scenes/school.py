@@ -56,6 +56,7 @@ def school(seed: int) -> Blueprint:
     _cloakroom(build, rng)
     _art_room(build, rng)
     _corridor(build, rng)
+    _drawings(build, rng)
     _lamps(build)
     return build.blueprint(floor_bounds=(0.0, 0.0, LENGTH_M, WIDTH_M))
 
@@ -171,6 +172,21 @@ def _corridor(build: Builder, rng: np.random.Generator) -> None:
     hang(build, wall_frame(*_HIGH, 9.95), (0.0, 1.6), (1.1, 0.8), _sheet(build, rng, land_map, (1.1, 0.8)), name="map")
     board = build.texture(pinboard(rng, (300, 400), base=(70, 84, 66), sheets=10))
     hang(build, wall_frame(*_EAST, 6.0), (0.0, 1.55), (1.25, 0.95), board, name="board", depth_m=0.03)
+
+
+def _drawings(build: Builder, rng: np.random.Generator) -> None:
+    """Hang pupils' work in a row above doors and lockers, on both sides of the corridor's walls, here and there a gap."""
+    size = (0.6, 0.42)
+    for line in (_LOW, _HIGH):
+        for side in ("left", "right"):
+            for at in np.arange(0.8, LENGTH_M - 0.6, 0.95):
+                make: Picture = (pupil_drawing, pupil_drawing, strokes, still_life)[int(rng.integers(4))]
+                near_part = side == "right" and abs(at - (CLASS_X if line is _LOW else LENGTH_M - CLASS_X)) < 0.5
+                if rng.random() < 0.2 or near_part:
+                    continue
+                place = wall_frame(*line, float(at + rng.uniform(-0.12, 0.12)), side=side)
+                up = 2.55 + float(rng.uniform(-0.05, 0.05))
+                hang(build, place, (0.0, up), size, _sheet(build, rng, make, size), name="drawing", depth_m=0.008)
 
 
 def _lamps(build: Builder) -> None:
