@@ -37,7 +37,7 @@ KITCHEN_X, CORRIDOR_Y, ROOMS_Y = 11.4, 6.2, 7.7
 _PX_PER_M, _FLOOR_PX_PER_M = 110, 120
 _DOWN = Rotation.from_euler("x", np.pi)
 # The share of a stretch of wall that prints cover.
-_HUNG_SHARE = 0.78
+_HUNG_SHARE = 0.95
 _WINDOW_POWER, _LAMP_POWER = 3.0, 4.2
 
 
