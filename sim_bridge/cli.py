@@ -51,7 +51,8 @@ def synthesize(
         layout: names of topics and frames: generic, or those of a driver, spot_ros1 or spot_ros2
         waypoints: number of waypoints, each with a tripod tag
         starts: each waypoint reached from the start tag, as in the paper, or once for the whole session
-        stations: number of places at which the mapping rig takes its images; by default three images per m2 or so
+        stations: number of places at which the mapping rig takes its images; by default one per m2 of
+            floor that can be seen, at most 150
         quality: JPEG quality of the arm camera's images, 1 to 100; by default that of its sensor
         sensors: what the sensors add: standard, ideal (nothing), or a TOML file like a session's sensors.toml
         without: effects to switch off: lens, exposure, vignetting, noise, blur, jpeg, depth_noise, depth_holes
@@ -64,6 +65,7 @@ def synthesize(
     """
     from sim_bridge.errors import SynthesisError
     from sim_bridge.importing import MeshOptions
+    from sim_bridge.mapping.lenses import refuse_lenses
     from sim_bridge.recording.recorder import own_format
     from sim_bridge.scenes.changes import find_changes
     from sim_bridge.sensors import load_sensors, with_lens, with_quality
@@ -81,6 +83,7 @@ def synthesize(
             raise SynthesisError(f"--{name} {value}: expected {low}..{high}", hint="choose another number")
     chosen = load_sensors(sensors) if lens is None else with_lens(load_sensors(sensors), lens)
     chosen = switched_off(chosen if quality is None else with_quality(chosen, quality), without)
+    refuse_lenses(chosen, where=sensors)
     standard = SessionOptions()
     options = dataclasses.replace(
         standard,
@@ -134,7 +137,10 @@ def dataset(
     """
     from sim_bridge.dataset import DatasetOptions, make_scenes
     from sim_bridge.importing import MeshOptions
+    from sim_bridge.mapping.lenses import refuse_lenses
+    from sim_bridge.sensors import load_sensors
 
+    refuse_lenses(load_sensors(sensors), where=sensors)
     mesh = MeshOptions(up=up, unit=unit)
     options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh)
     made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())

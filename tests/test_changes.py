@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import FieldkitError
 from fieldkit.frames import Pose, yaw_pose
+from sim_bridge.scenes import make_blueprint
 from sim_bridge.scenes.blueprint import Blueprint, Builder
 from sim_bridge.scenes.changes import (
     STANDARD_CHANGES,
@@ -254,3 +255,25 @@ def test_unknown_changes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text("version = 1\nmoved = 1.5\n")
     with pytest.raises(FieldkitError, match=r"own\.toml: Expected `float` <= 1.0 - at `\$\.moved`"):
         find_changes(str(tmp_path / "own.toml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("dimmed = [1.1, 0.75]", r"dimmed is \[1.1, 0.75\]; expected the smaller factor first"),
+        ("dimmed = [0.5, inf]", r"at `\$\.dimmed"),
+        ("farthest_m = inf", r"at `\$\.farthest_m`"),
+        ("turned_deg = 400", r"at `\$\.turned_deg`"),
+        ("moved = 0.7\nremoved = 0.6", "moved and removed add up to 1.3; expected at most 1"),
+    ],
+)
+def test_changes_beyond_sense_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(f"version = 1\n{text}\n")
+    with pytest.raises(FieldkitError, match=message):
+        find_changes(str(path))
+
+
+def test_passages_wider_than_all_floor_are_refused() -> None:
+    with pytest.raises(FieldkitError, match=r"no floor is free for a disc of 2 m"):
+        changed(make_blueprint("room", 0), ChangeOptions(passage_m=2.0), rng=np.random.default_rng(0))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError
+from sim_bridge import cli
 from sim_bridge.sensors import (
     IDEAL,
     LENSES,
@@ -352,6 +353,13 @@ def test_every_effect_can_be_switched_off_everywhere(effect: str) -> None:
         ("version = 1\n[hand.glare]\n", r"unknown field `glare`"),
         ("version = 2\n", r"version 2; this fieldkit reads version 1"),
         ("version = 1\n[hand.lens]\nkind = 'prism'\ncoefficients = [0, 0, 0, 0]\n", "Invalid enum value 'prism'"),
+        ("version = 1\n[hand.lens]\nkind = 'radtan'\ncoefficients = [nan, 0, 0, 0]\n", r"at `\$\.hand\.lens\.coeff"),
+        ("version = 1\n[hand.exposure]\nwhite_s = inf\n", r"at `\$\.hand\.exposure\.white_s`"),
+        (
+            "version = 1\n[hand.exposure]\nshortest_s = 0.1\nlongest_s = 0.01\n",
+            "shortest_s 0.1 is above longest_s 0.01",
+        ),
+        ("version = 1\n[hand_depth.depth_holes]\nnear_m = 7.0\n", "near_m 7 is not below far_m 6"),
     ],
 )
 def test_a_bad_sensors_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -370,3 +378,15 @@ def test_unknown_names_are_refused() -> None:
         with_lens(STANDARD, "prism")
     with pytest.raises(FieldkitError, match=r"none\.toml: no such file"):
         load_sensors("none.toml")
+
+
+def test_a_lens_that_cannot_be_drawn_is_refused_before_anything_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text("version = 1\n[hand.lens]\nkind = 'radtan'\ncoefficients = [-0.6, 0, 0, 0]\n")
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["synthesize", "--sensors", str(path), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    assert f"{path}: [hand.lens]: camera OPENCV 640x480: field of view too wide" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

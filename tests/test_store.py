@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -185,6 +188,41 @@ def test_a_cache_that_cannot_be_read_is_named_and_garbage_is_ignored(tmp_path: P
         store.EstimateCache(tmp_path / "cache").get("a")
     (tmp_path / "garbage").write_bytes(b"\xff\xfe\n5\n[]\n{}\n")
     assert store.EstimateCache(tmp_path / "garbage").get("a") is None
+
+
+def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    code = f"""
+import resource
+from pathlib import Path
+from fieldkit import errors, store
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+import signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+try:
+    with store.atomic_folder(Path({str(tmp_path / "out")!r})) as work:
+        (work / "new.bin").write_bytes(bytes(20_000))
+except errors.StoreError as error:
+    print(error)
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "out: cannot be written: File too large; expected room for all of it" in found.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_process_left_of_a_folder_is_removed(tmp_path: Path) -> None:
+    code = f"""
+import os, signal
+from pathlib import Path
+from fieldkit import store
+with store.atomic_folder(Path({str(tmp_path / "out")!r})) as work:
+    (work / "half.txt").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
+    (tmp_path / ".out.notes").mkdir()
+    assert len(list(tmp_path.iterdir())) == 2
+    with store.atomic_folder(tmp_path / "out") as mine, store.atomic_folder(tmp_path / "other"):
+        assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".out")) == [".out.notes", mine.name]
 
 
 def test_a_folder_that_fails_half_way_leaves_the_old_one(tmp_path: Path) -> None:

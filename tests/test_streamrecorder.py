@@ -169,6 +169,27 @@ def test_a_missing_image_leaves_nothing(session: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "keep", "message"),
+    [
+        ("images/rf/000001.jpg", 0.6, r"000001\.jpg: missing or damaged; expected an image"),
+        ("slam_poses.txt", 0.0, r"slam_poses\.txt: holds no pose; expected one per station"),
+    ],
+)
+def test_a_file_cut_short_leaves_nothing(session: Path, tmp_path: Path, name: str, keep: float, message: str) -> None:
+    path = session / "mapping" / name
+    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+    with pytest.raises(SynthesisError, match=message):
+        export_streamrecorder(session, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_image_of_another_size_is_refused(session: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(session / "mapping" / "depth" / "000001.png"), np.zeros((3, 5), np.uint16))
+    with pytest.raises(SynthesisError, match=r"000001\.png: 5 x 3 pixels; expected an image of the mapping walk"):
+        export_streamrecorder(session, tmp_path / "out")
+
+
 def test_another_rig_is_refused(session: Path, tmp_path: Path) -> None:
     rig = read_rig(session / "mapping" / "rig.toml")
     write_rig(session / "mapping" / "rig.toml", Rig(rig.cameras[:2], rig.depth))
@@ -181,3 +202,4 @@ def test_an_existing_export_is_kept(session: Path, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="exists already"):
         export_streamrecorder(session, tmp_path / "out")
     export_streamrecorder(session, tmp_path / "out", force=True)
+    export_streamrecorder(session, tmp_path / "out", separator=" ", force=True)

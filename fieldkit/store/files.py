@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import math
 import os
 import re
 import shutil
+import socket
 import tempfile
 import tomllib
 from collections.abc import Iterator
@@ -22,6 +24,9 @@ import tomli_w
 from fieldkit.errors import StoreError, suggestion
 
 T = TypeVar("T", bound=msgspec.Struct)
+
+# What a file system says that has no more room, or has broken, whatever is written.
+_DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EIO})
 
 
 @contextlib.contextmanager
@@ -67,22 +72,54 @@ def atomic_write(path: Path, data: bytes | str) -> None:
 def atomic_folder(path: Path, *, force: bool = False, marker: str | None = None) -> Iterator[Path]:
     """Yield an empty folder beside ``path`` that takes its place on success and vanishes on failure.
 
-    Raises StoreError as `refuse_existing` does, which is asked again before the folder is replaced, or when the
-    folder cannot be made.
+    What a killed process left of the same folder is removed first. Raises StoreError as `refuse_existing` does, which
+    is asked again before the folder is replaced, when the folder cannot be made, or when the disk is full.
     """
     path = Path(path)
     refuse_existing(path, force=force, marker=marker, kind="folder")
     with saving(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+        _remove_leftovers(path)
+        work = Path(tempfile.mkdtemp(dir=path.parent, prefix=f"{_own_prefix(path)}{os.getpid()}."))
     try:
-        yield work
+        try:
+            yield work
+        except OSError as error:
+            if error.errno not in _DISK_ERRORS:
+                raise
+            raise StoreError(
+                f"{path}: cannot be written: {error.strerror}; expected room for all of it",
+                hint="make room, or choose another --out",
+            ) from error
         refuse_existing(path, force=force, marker=marker, kind="folder")
         with saving(path):
             work.chmod(0o755)
             _replace(work, path)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _own_prefix(path: Path) -> str:
+    return f".{path.name}.{re.sub(r'[^A-Za-z0-9-]', '-', socket.gethostname())}-"
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove unfinished folders of ``path`` whose process, on this host, is no more."""
+    prefix = _own_prefix(path)
+    for found in path.parent.iterdir():
+        pid = found.name.removeprefix(prefix).split(".")[0] if found.name.startswith(prefix) else ""
+        if pid.isdecimal() and not _runs(int(pid)):
+            shutil.rmtree(found, ignore_errors=True)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 def _replace(work: Path, path: Path) -> None:

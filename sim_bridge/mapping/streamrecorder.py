@@ -64,9 +64,16 @@ def export_streamrecorder(
             f"{mapping / 'rig.toml'}: no camera {', '.join(missing)}; expected ll, lf, rf and rr",
             hint="export a session that sim-bridge synthesized",
         )
+    if not stations:
+        raise SynthesisError(
+            f"{mapping / 'slam_poses.txt'}: holds no pose; expected one per station of the walk",
+            hint="synthesize the session again",
+        )
     rig_from_device = _stored_frame(next(c for c in rig.cameras if c.name == "lf"), QUARTER_TURNS["lf"])
     walk = _Walk(mapping, tuple(stations), _ticks([pose for _, pose in stations]), rig_from_device)
-    marker = "VLC LF_rig2world.txt".replace(" ", separator)
+    # Either spelling is an export.
+    markers = [f"VLC{between}LF_rig2world.txt" for between in (separator, "_", " ")]
+    marker = next((name for name in markers if (Path(out) / name).is_file()), markers[0])
     with atomic_folder(out, force=force, marker=marker) as folder:
         return {
             name: _write_sensor(folder / name.replace(" ", separator), camera, turns, walk=walk)
@@ -86,11 +93,13 @@ def _write_sensor(path: Path, camera: RigCamera, turns: int, *, walk: _Walk) -> 
     rays, lines = stored_rays(camera, turns), []
     for (frame, slam_from_rig), tick in zip(walk.stations, walk.ticks, strict=True):
         if turns:
-            image = np.rot90(_read(walk.mapping / "images" / camera.name / f"{frame}.jpg", cv2.IMREAD_GRAYSCALE), turns)
+            upright = _read(walk.mapping / "images" / camera.name / f"{frame}.jpg", cv2.IMREAD_GRAYSCALE, camera)
+            image = np.rot90(upright, turns)
         else:
-            along_axis = _read(walk.mapping / "depth" / f"{frame}.png", cv2.IMREAD_UNCHANGED)
-            # Depth is stored along the ray, not along the axis.
-            image = np.rint(along_axis / rays[..., 2]).astype(np.uint16)
+            along_axis = _read(walk.mapping / "depth" / f"{frame}.png", cv2.IMREAD_UNCHANGED, camera)
+            # Depth is stored along the ray, not along the axis; what 16 bits cannot hold is no depth.
+            along_ray = np.rint(along_axis / rays[..., 2])
+            image = np.where(along_ray <= np.iinfo(np.uint16).max, along_ray, 0).astype(np.uint16)
         (path / f"{tick}.pgm").write_bytes(pgm(image))
         lines.append(f"{tick},{_numbers(_WORLD_FROM_SLAM * slam_from_rig * walk.rig_from_device)}\n")
     device_from_cam = walk.rig_from_device.inv() * _stored_frame(camera, turns)
@@ -134,10 +143,16 @@ def _numbers(a_from_b: Pose) -> str:
     return ",".join(f"{value:.9g}" for value in a_from_b.as_matrix().ravel())
 
 
-def _read(path: Path, flags: int) -> Image:
-    image = cv2.imread(str(path), flags)
-    if image is None:
+def _read(path: Path, flags: int, camera: RigCamera) -> Image:
+    """Read an image of a rig's camera; raises SynthesisError when it is missing, cut short, or of another size."""
+    data = path.read_bytes() if path.is_file() else b""
+    whole = data.endswith(b"\xff\xd9") if path.suffix == ".jpg" else True
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and whole else None
+    size = (camera.camera.height, camera.camera.width)
+    if image is None or image.shape != size:
+        found = "missing or damaged" if image is None else f"{' x '.join(map(str, image.shape[::-1]))} pixels"
         raise SynthesisError(
-            f"{path}: missing or damaged; expected an image of the mapping walk", hint="synthesize the session again"
+            f"{path}: {found}; expected an image of the mapping walk, {size[1]} x {size[0]} pixels",
+            hint="synthesize the session again",
         )
     return np.asarray(image)

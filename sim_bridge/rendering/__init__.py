@@ -56,12 +56,6 @@ def render_numba(scene: Scene, camera: Camera, world_from_cam: Pose, *, samples:
         return Image(drawn.rgb, drawn.depth_m)
     nodes = _directions(camera)
     low, high = nodes.min(axis=(0, 1)), nodes.max(axis=(0, 1))
-    if max(float(-low.min()), float(high.max())) > WIDEST_TAN:
-        raise CameraError(
-            f"camera {camera.model} {camera.width}x{camera.height}: field of view too wide to render; "
-            f"expected at most {np.degrees(np.arctan(WIDEST_TAN)):.0f} deg off the axis",
-            hint="use a longer focal length or a weaker distortion",
-        )
     focal = OVERSAMPLING * np.asarray(camera.focal_px)
     centre = _MARGIN_PX - focal * low
     width, height = (int(v) for v in np.ceil(focal * (high - low) + 2 * _MARGIN_PX))
@@ -72,12 +66,29 @@ def render_numba(scene: Scene, camera: Camera, world_from_cam: Pose, *, samples:
     return Image(rgb, depth)
 
 
+def check_camera(camera: Camera) -> None:
+    """Raise CameraError for a camera that `render` refuses: its lens looks too far aside, or folds the picture."""
+    if not camera.is_pinhole:
+        _directions(camera)
+
+
 def _directions(camera: Camera) -> Array:
-    """Return normalised coordinates f64[r,c,2] at every 16th pixel centre, from one step before to two after."""
+    """Return normalised coordinates f64[r,c,2] at every 16th pixel centre, from one step before to two after.
+
+    Raises CameraError where they reach beyond WIDEST_TAN.
+    """
     cols = np.arange(-1, (camera.width - 1) // _STEP + 3) * _STEP + 0.5
     rows = np.arange(-1, (camera.height - 1) // _STEP + 3) * _STEP + 0.5
     grid = np.stack(np.meshgrid(cols, rows), axis=-1)
-    return camera.unproject(grid.reshape(-1, 2))[:, :2].reshape(grid.shape)
+    nodes = camera.unproject(grid.reshape(-1, 2))[:, :2].reshape(grid.shape)
+    # Written so that what is no number is refused, too.
+    if not float(np.abs(nodes).max()) <= WIDEST_TAN:
+        raise CameraError(
+            f"camera {camera.model} {camera.width}x{camera.height}: field of view too wide to render; "
+            f"expected at most {np.degrees(np.arctan(WIDEST_TAN)):.0f} deg off the axis",
+            hint="use a longer focal length or a weaker distortion",
+        )
+    return nodes
 
 
 def _draw(scene: Scene, matrix: Array, size: tuple[int, int], *, samples: int) -> _Drawn:

@@ -20,7 +20,8 @@ from sim_bridge.scenes.light import Light, lit, unlit
 from sim_bridge.scenes.placing import Floor, Item, Items
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
-NotNegative = Annotated[float, Meta(ge=0.0)]
+Metres = Annotated[float, Meta(ge=0.0, le=100.0)]
+Factor = Annotated[float, Meta(ge=0.0, le=100.0)]
 
 # Tries to find a new place for a thing before it stays where it is.
 TRIES = 24
@@ -43,12 +44,20 @@ class ChangeOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     exchanged_pictures: Share = 0.1
     removed_pictures: Share = 0.05
     lamps_off: Share = 0.15
-    farthest_m: NotNegative = 0.9
-    turned_deg: NotNegative = 50.0
-    strewn_m: NotNegative = 0.3
-    passage_m: NotNegative = 0.4
-    daylight: tuple[NotNegative, NotNegative] = (0.3, 1.5)
-    dimmed: tuple[NotNegative, NotNegative] = (0.75, 1.1)
+    farthest_m: Metres = 0.9
+    turned_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 50.0
+    strewn_m: Metres = 0.3
+    passage_m: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.4
+    daylight: tuple[Factor, Factor] = (0.3, 1.5)
+    dimmed: tuple[Factor, Factor] = (0.75, 1.1)
+
+    def __post_init__(self) -> None:
+        for name in ("daylight", "dimmed"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name} is [{low:g}, {high:g}]; expected the smaller factor first")
+        if self.moved + self.removed > 1.0:
+            raise ValueError(f"moved and removed add up to {self.moved + self.removed:g}; expected at most 1")
 
 
 STANDARD_CHANGES = ChangeOptions()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from fieldkit.frames import Pose
+from sim_bridge.errors import SynthesisError
 from sim_bridge.mesh import Array, Scene
 from sim_bridge.scenes.blueprint import Block, Blueprint, Kind, Quad, Thing
 from sim_bridge.scenes.light import unlit
@@ -196,12 +197,17 @@ class Floor:
 
     @classmethod
     def of(cls, blueprint: Blueprint, radius_m: float) -> Floor:
-        """Find the free floor of a blueprint."""
+        """Find the free floor of a blueprint; raises SynthesisError where there is none."""
         scene = unlit(blueprint)
         x0, y0, x1, y1 = blueprint.floor_bounds
         axes = (np.arange(low + CELL_M / 2, high, CELL_M) for low, high in ((x0, x1), (y0, y1)))
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         free = scene.free_floor(grid.reshape(-1, 2), radius_m).reshape(grid.shape[:2])
+        if not free.any():
+            raise SynthesisError(
+                f"no floor is free for a disc of {radius_m:g} m; expected passages of this radius",
+                hint="choose a smaller passage_m",
+            )
         connected = _largest(free)
         return cls(grid[connected], scene, radius_m, grid, free, connected)
 

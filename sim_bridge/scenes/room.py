@@ -26,7 +26,6 @@ from sim_bridge.scenes.blueprint import Blueprint, Builder
 from sim_bridge.scenes.plan import on_wall
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 9.0, 7.0, 3.0
-WALL_DEPTH_M = 0.6
 # Centre line of the corridor along the walls, and of the passage between the islands.
 _LOOP_M = 1.17
 _MIDDLE_M = LENGTH_M / 2

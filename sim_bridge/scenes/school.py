@@ -175,7 +175,7 @@ def _corridor(build: Builder, rng: np.random.Generator) -> None:
 
 
 def _drawings(build: Builder, rng: np.random.Generator) -> None:
-    """Hang pupils' work in a row above doors and lockers, on both sides of the corridor's walls, here and there a gap."""
+    """Hang pupils' work in a row above doors and lockers, on both sides of the corridor's walls, with some gaps."""
     size = (0.6, 0.42)
     for line in (_LOW, _HIGH):
         for side in ("left", "right"):

@@ -17,9 +17,12 @@ from fieldkit.errors import suggestion
 from fieldkit.store import read_toml, write_toml
 from sim_bridge.errors import SynthesisError
 
-Positive = Annotated[float, Meta(gt=0.0)]
+# Beyond any camera's: what a slip of the pen, or inf, exceeds.
+_MOST = 1e6
+Positive = Annotated[float, Meta(gt=0.0, le=_MOST)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
-NotNegative = Annotated[float, Meta(ge=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0, le=_MOST)]
+Coefficient = Annotated[float, Meta(ge=-1000.0, le=1000.0)]
 Effect = Literal["lens", "exposure", "vignetting", "noise", "blur", "jpeg", "depth_noise", "depth_holes"]
 
 
@@ -35,7 +38,7 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Distortion: four coefficients k1 k2 p1 p2 (radtan) or k1 k2 k3 k4 (fisheye) in OpenCV's order."""
 
     kind: Literal["radtan", "fisheye"]
-    coefficients: tuple[float, float, float, float]
+    coefficients: tuple[Coefficient, Coefficient, Coefficient, Coefficient]
 
 
 class Exposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -50,10 +53,14 @@ class Exposure(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     white_s: Positive = 0.04
     shortest_s: Positive = 0.0002
     longest_s: Positive = 0.02
-    most_gain: Annotated[float, Meta(ge=1.0)] = 16.0
+    most_gain: Annotated[float, Meta(ge=1.0, le=_MOST)] = 16.0
     error_ev: NotNegative = 0.1
     step_ev: NotNegative = 0.125
-    highlights: Annotated[float, Meta(ge=1.0)] = 3.0
+    highlights: Annotated[float, Meta(ge=1.0, le=_MOST)] = 3.0
+
+    def __post_init__(self) -> None:
+        if self.shortest_s > self.longest_s:
+            raise ValueError(f"shortest_s {self.shortest_s:g} is above longest_s {self.longest_s:g}; expected it below")
 
 
 class Vignetting(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -102,6 +109,10 @@ class DepthHoles(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     edge_share: Share = 0.8
     grazing_deg: NotNegative = 8.0
     speckle_share: Share = 0.002
+
+    def __post_init__(self) -> None:
+        if self.near_m >= self.far_m:
+            raise ValueError(f"near_m {self.near_m:g} is not below far_m {self.far_m:g}; expected it nearer")
 
 
 class ColourSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

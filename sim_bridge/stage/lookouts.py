@@ -26,7 +26,8 @@ class LookoutOptions:
     """How many places and directions: ``views`` arm poses in full yaw and ``pitch_deg``, one per stratum.
 
     The robot drives as a disc of ``drive_radius_m`` and stands as one of ``stand_radius_m``; the camera keeps
-    ``clearance_m`` from everything in all views. Forward looks along the way to the next place, ``lookahead_m`` ahead.
+    ``clearance_m`` from everything, stowed and in the sweep. Forward looks along the way to the next place,
+    ``lookahead_m`` ahead.
     """
 
     count: int = 100
