@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Features
+from fieldkit.maps.order import walk_order
 from fieldkit.maps.pairs import Pair
 from fieldkit.maps.source import SourceImage
 
@@ -94,7 +95,7 @@ def _walked(images: Sequence[SourceImage]) -> Array:
         sequences.setdefault(image.sequence, []).append(i)
     for members in sequences.values():
         last, total = None, 0.0
-        for i in sorted(members, key=lambda i: images[i].frame):
+        for i in walk_order(images, members):
             pose = images[i].slam_from_cam
             if pose is not None:
                 total += 0.0 if last is None else float(np.linalg.norm(pose.translation - last))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.frames import Pose
+from fieldkit.maps.order import walk_order
 from fieldkit.maps.source import SourceImage
 
 Array = NDArray[np.float64]
@@ -34,7 +35,7 @@ def strays(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, t
         sequences.setdefault(images[i].sequence, []).append(i)
     wrong = set()
     for members in sequences.values():
-        order = sorted(members, key=lambda i: images[i].frame)
+        order = walk_order(images, members)
         for k, i in enumerate(order):
             if i in far:
                 ends = [j for j in (_nearest(order[:k][::-1], far), _nearest(order[k + 1 :], far)) if j is not None]
