@@ -230,7 +230,10 @@ def replay(
 
 
 def _refuse_mixture(recordings: Sequence[Path], sets: Sequence[Path], *, map: Path | None, tags: Path | None) -> None:
-    """Raise ReplayError where recordings lack a map, or datasets are given with what belongs to recordings."""
+    """Raise ReplayError where one does not exist, recordings lack a map, or datasets come with what is not theirs."""
+    missing = next((r for r in recordings if not r.exists()), None)
+    if missing is not None:
+        raise ReplayError(f"{missing}: no such file; expected a recording or a dataset", hint="check the path")
     other = next((r for r in recordings if r not in sets), None)
     if sets and (other is not None or map is not None or tags is not None):
         what = f"{other} is none" if other is not None else "--map or --tags is given, too"

@@ -269,6 +269,13 @@ def test_datasets_are_replayed_alone(
     assert message in capsys.readouterr().err
 
 
+def test_what_does_not_exist_is_said_to_be_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["replay", str(tmp_path / "nosuch"), "--out", str(tmp_path / "run")])
+    assert stop.value.code == 1
+    assert "nosuch: no such file; expected a recording or a dataset" in capsys.readouterr().err
+
+
 def test_a_damaged_shard_is_named(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "w0.npz"
     data = shard_path(whole, "tiny", "w0").read_bytes()
