@@ -17,6 +17,7 @@ from tyro.conf import UseAppendAction as Repeated
 
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
+from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
 
@@ -330,7 +331,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 }
 GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
     "map": {"build": map_build, "info": map_info, "compact": map_compact},
-    "tags": {"calibrate": tags_calibrate},
+    "tags": {"sheet": tags_sheet, "calibrate": tags_calibrate, "import": tags_import, "export": tags_export},
 }
 
 

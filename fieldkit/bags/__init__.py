@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from fieldkit.bags.detections import RecordedTag, RecordedTags, read_detections
 from fieldkit.bags.inspecting import inspect_recording
 from fieldkit.bags.layouts import LAYOUTS, Layout
 from fieldkit.bags.reading import open_recording
 from fieldkit.bags.tf import TfBuffer
 from fieldkit.bags.writing import BagFormat, RecordingWriter
 
-__all__ = ["LAYOUTS", "BagFormat", "Layout", "RecordingWriter", "TfBuffer", "inspect_recording", "open_recording"]
+__all__ = [
+    "LAYOUTS",
+    "BagFormat",
+    "Layout",
+    "RecordedTag",
+    "RecordedTags",
+    "RecordingWriter",
+    "TfBuffer",
+    "inspect_recording",
+    "open_recording",
+    "read_detections",
+]

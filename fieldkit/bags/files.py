@@ -20,6 +20,14 @@ from fieldkit.errors import BagError
 T = TypeVar("T")
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _IDL_SEPARATOR = "=" * 80 + "\nIDL: "
+_APRILTAG_MSGS = {
+    "apriltag_msgs/msg/Point": "float64 x\nfloat64 y",
+    "apriltag_msgs/msg/AprilTagDetection": (
+        "string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n"
+        "apriltag_msgs/Point centre\napriltag_msgs/Point[4] corners\nfloat64[9] homography"
+    ),
+    "apriltag_msgs/msg/AprilTagDetectionArray": "std_msgs/Header header\napriltag_msgs/AprilTagDetection[] detections",
+}
 EXPECTED = "expected a .bag, a .mcap, a ROS 2 folder with metadata.yaml, or a folder with session.toml"
 
 
@@ -31,8 +39,11 @@ def ros1_types() -> Typestore:
 
 
 def ros2_types() -> Typestore:
-    """Return the standard messages of ROS 2."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """Return the standard messages of ROS 2, with apriltag_msgs: before Iron no bag described its own messages."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for kind, definition in _APRILTAG_MSGS.items():
+        store.register(get_types_from_msg(definition, kind))
+    return store
 
 
 @dataclasses.dataclass(frozen=True)
