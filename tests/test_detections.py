@@ -117,13 +117,14 @@ def test_ros2_detections_are_read_also_where_the_bag_does_not_describe_them(
     assert found.n_messages == {TOPIC: 2}
 
 
-def test_tagslam_s_pixels_are_opencv_s_and_its_family_may_be_only_a_detector(tmp_path: Path) -> None:
+def test_tagslam_s_pixels_are_those_of_the_detector_that_its_family_may_name(tmp_path: Path) -> None:
     corners = np.array([[10.0, 40.0], [42.0, 41.0], [41.0, 9.0], [9.0, 8.0]])
     store = with_types(ros1_types(), TAGSLAM)
-    messages = [tagslam_message(store, corners, family=name) for name in ("mit", "36h11", "tf25h9")]
+    messages = [tagslam_message(store, corners, family=name) for name in ("mit", "36h11", "tf25h9", "umich", "")]
     found = read_detections(ros1_bag(tmp_path / "t.bag", store, "apriltag_msgs/msg/ApriltagArrayStamped", messages))
-    assert [t.family for t in found.tags] == [None, "tag36h11", "tag25h9"]
-    np.testing.assert_allclose(found.tags[0].corners_px, corners + 0.5)
+    assert [t.family for t in found.tags] == [None, "tag36h11", "tag25h9", None, None]
+    for tag, shift in zip(found.tags, (0.5, 0.5, 0.5, 0.0, 0.0), strict=True):
+        np.testing.assert_allclose(tag.corners_px, corners + shift)
     assert found.tags[0].hamming == 2
 
 

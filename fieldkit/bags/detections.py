@@ -22,8 +22,10 @@ from fieldkit.frames import Pose, pose
 
 Array = NDArray[np.float64]
 
-# OpenCV puts the centre of the first pixel at (0, 0), COLMAP and AprilTag 3 at (0.5, 0.5)
+# The MIT detector, as OpenCV, puts the centre of the first pixel at (0, 0); COLMAP, AprilTag 2 and 3 at (0.5, 0.5)
 _OPENCV_PX = 0.5
+# What the node for AprilTag 2 writes as the family
+_UMICH = ("umich", "")
 _FAMILY = re.compile(r"(?:tag|tf)?(36h1[01]|25h9|16h5|circle21h7|circle49h12|custom48h12|standard41h12|standard52h13)")
 
 
@@ -132,9 +134,10 @@ def _collect(
 
 
 def _from_tagslam(topic: str, message: Any, refused: Counter[str]) -> Iterator[RecordedTag]:
-    """Read apriltag_msgs/ApriltagArrayStamped, which TagSLAM reads: pixels as OpenCV's, corners from bottom-left."""
+    """Read apriltag_msgs/ApriltagArrayStamped, which TagSLAM reads: pixels by detector, corners from bottom-left."""
     for tag in message.apriltags:
-        corners = np.array([[p.x, p.y] for p in tag.corners], dtype=np.float64) + _OPENCV_PX
+        shift = 0.0 if tag.family.strip().lower() in _UMICH else _OPENCV_PX
+        corners = np.array([[p.x, p.y] for p in tag.corners], dtype=np.float64) + shift
         if not _is_quad(corners, refused):
             continue
         yield RecordedTag(
