@@ -91,7 +91,10 @@ class Recording:
 
 @dataclasses.dataclass(frozen=True)
 class TagPhoto:
-    """What became of one photo of a tag: ``reason`` is empty when it was used; sigma is its deviation in sigmas."""
+    """What became of one photo of a tag: ``reason`` is empty when it was used; sigma is its deviation in sigmas.
+
+    ``flipped``: by itself the photo prefers the tag's other planar solution, which the others exclude.
+    """
 
     file: str
     tag_id: int
@@ -100,11 +103,16 @@ class TagPhoto:
     visit: str | None = None
     ambiguity: float = 0.0
     sigma: float = 0.0
+    flipped: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class TagPose:
-    """A tag in the map: map_from_tag, its 6x6 covariance, edge length of the black square, and how it was found."""
+    """A tag in the map: map_from_tag, its 6x6 covariance, edge length of the black square, and how it was found.
+
+    ``leave_one_out``: by how much (m, rad) the pose moves at most without one of its photos. ``size_from_map``: the
+    edge (m) that the map's scale shows, and its standard deviation. None where nothing tells.
+    """
 
     id: int
     family: str
@@ -115,6 +123,8 @@ class TagPose:
     rms_px: float
     visit: str | None = None
     verdict: Literal["pass", "warn", "fail"] = "pass"
+    leave_one_out: tuple[float, float] | None = None
+    size_from_map: tuple[float, float] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import LocalizeError
 from fieldkit.features import extract, feature_kind, working_factor
 from fieldkit.features.matching import match_groups
+from fieldkit.localize.kernels import NOISE_PX
 from fieldkit.localize.matching import stored_descriptors
-from fieldkit.localize.pose import PosedPoints, confidence, estimate_pose
+from fieldkit.localize.pose import PosedPoints, confidence, estimate_pose, shared_covariance, subset
 from fieldkit.localize.retrieval import build_index, most_similar
 from fieldkit.protocol import LocalizerRules
 from fieldkit.types import Estimate, Image, SceneMap
 
-__all__ = ["Localizer"]
+__all__ = ["Inliers", "Localizer"]
 
 _MAX_KEYPOINTS = 2048
 _MAX_SIDE_PX = 1600
+
+
+@dataclasses.dataclass(frozen=True)
+class Inliers:
+    """The matches that an estimate rests on: landmarks int[n] of the map, where they are seen f64[n, 2] in the image's
+    pixels, and the noise of these per axis; and what of the estimate's covariance (6x6) all photos of the place share.
+    """
+
+    landmark: NDArray[np.int32]
+    pixels: NDArray[np.float64]
+    noise_px: float
+    shared: NDArray[np.float64]
 
 
 class Localizer:
@@ -45,6 +60,10 @@ class Localizer:
 
         Raises LocalizeError when the image does not have the camera's size.
         """
+        return self.localize_with_inliers(image, camera)[0]
+
+    def localize_with_inliers(self, image: Image, camera: Camera) -> tuple[Estimate, Inliers | None]:
+        """Localize as `localize` does; also return the matches that the pose rests on, None without a pose."""
         if image.shape[:2] != (camera.height, camera.width):
             raise LocalizeError(
                 f"image is {image.shape[1]}x{image.shape[0]}; its camera says {camera.width}x{camera.height}",
@@ -54,7 +73,7 @@ class Localizer:
         features = extract(image, feature=self._map.feature, max_keypoints=_MAX_KEYPOINTS, max_side_px=_MAX_SIDE_PX)
         seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
         if len(features) < rules.min_inliers:
-            return _failed("no_features", 0, 0, seconds)
+            return _failed("no_features", 0, 0, seconds), None
         images = most_similar(self._index, features.descriptors, count=rules.top_k)
         seconds["retrieve"], start = time.perf_counter() - start, time.perf_counter()
         stored, landmark = stored_descriptors(self._map, self._index, images)
@@ -62,9 +81,10 @@ class Localizer:
         keypoint, found, _ = match_groups(features.descriptors, stored, landmark, ratio=ratio)
         seconds["match"], start = time.perf_counter() - start, time.perf_counter()
         if len(found) < rules.min_inliers:
-            return _failed("no_matches", len(found), 0, seconds)
+            return _failed("no_matches", len(found), 0, seconds), None
         # Thresholds and noise are meant in pixels of the image in which the keypoints were found.
-        focal_px = np.asarray(camera.focal_px) * working_factor(image.shape[:2], max_side_px=_MAX_SIDE_PX)
+        factor = working_factor(image.shape[:2], max_side_px=_MAX_SIDE_PX)
+        focal_px = np.asarray(camera.focal_px) * factor
         points = PosedPoints(
             camera.unproject(features.keypoints_px[keypoint])[:, :2] * focal_px,
             self._map.xyz[found],
@@ -74,12 +94,15 @@ class Localizer:
         solved = estimate_pose(points, max_error_px=rules.max_reprojection_px, seed=self._seed)
         seconds["pnp"] = time.perf_counter() - start
         if solved is None:
-            return _failed("no_pose", len(found), 0, seconds)
+            return _failed("no_pose", len(found), 0, seconds), None
         n_inliers = int(solved.inliers.sum())
         if n_inliers < rules.min_inliers:
-            return _failed("few_inliers", len(found), n_inliers, seconds)
-        sure = confidence(features.keypoints_px[keypoint[solved.inliers]], (camera.width, camera.height))
-        return Estimate(solved.map_from_cam, solved.covariance, len(found), n_inliers, "ok", sure, seconds)
+            return _failed("few_inliers", len(found), n_inliers, seconds), None
+        pixels = features.keypoints_px[keypoint[solved.inliers]]
+        sure = confidence(pixels, (camera.width, camera.height))
+        shared = shared_covariance(subset(points, solved.inliers), solved.map_from_cam)
+        inliers = Inliers(found[solved.inliers], pixels.astype(np.float64), NOISE_PX / factor, shared)
+        return Estimate(solved.map_from_cam, solved.covariance, len(found), n_inliers, "ok", sure, seconds), inliers
 
 
 def _failed(status: str, n_matches: int, n_inliers: int, seconds: dict[str, float]) -> Estimate:

@@ -57,7 +57,7 @@ def estimate_pose(points: PosedPoints, *, max_error_px: float, seed: int) -> Sol
         (*refine_pose(kept, start.map_from_cam), kept)
         for start in starts
         if start is not None
-        for kept in [_subset(points, start.inliers)]
+        for kept in [subset(points, start.inliers)]
     ]
     if not refined:
         return None
@@ -146,7 +146,8 @@ def _residuals(points: PosedPoints, map_from_cam: Pose) -> tuple[Array, Array]:
     return x_in_cam[:, :2] / depth * points.focal_px - points.pixels, x_in_cam
 
 
-def _subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
+def subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
+    """Return the matches in ``rows`` bool[n]."""
     return PosedPoints(points.pixels[rows], points.xyz[rows], points.xyz_covariance[rows], points.focal_px)
 
 

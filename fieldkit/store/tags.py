@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,6 +26,10 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     rms_px: float
     verdict: Literal["pass", "warn", "fail"]
     visit: str | None = None
+    leave_one_out_m: float | None = None
+    leave_one_out_deg: float | None = None
+    size_from_map_m: float | None = None
+    size_sigma_m: float | None = None
 
 
 class _Photo(msgspec.Struct, forbid_unknown_fields=True):
@@ -35,6 +40,7 @@ class _Photo(msgspec.Struct, forbid_unknown_fields=True):
     ambiguity: float
     sigma: float
     visit: str | None = None
+    flipped: bool = False
 
 
 class _TagsFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -59,7 +65,9 @@ def read_tags(path: Path) -> TagMap:
     keys = [(t.id, t.visit) for t in tags]
     if len(set(keys)) != len(keys):
         raise StoreError(f"{path}: a tag is listed twice for the same visit", hint="keep one [[tag]] per id and visit")
-    photos = tuple(TagPhoto(p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma) for p in data.photo)
+    photos = tuple(
+        TagPhoto(p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma, p.flipped) for p in data.photo
+    )
     return TagMap(tuple(tags), photos, data.map_digest, digest=digest(path), path=str(path))
 
 
@@ -69,10 +77,13 @@ def _tag(entry: _Tag) -> TagPose:
     covariance = np.asarray(entry.covariance).reshape(6, 6)
     if not np.isfinite(covariance).all() or np.linalg.eigvalsh((covariance + covariance.T) / 2).min() < -1e-12:
         raise StoreError("covariance is not positive semi-definite")
+    spread, size = (entry.leave_one_out_m, entry.leave_one_out_deg), (entry.size_from_map_m, entry.size_sigma_m)
     map_from_tag = pose(entry.position_m, entry.quaternion_xyzw)
     return TagPose(
         entry.id, entry.family, entry.size_m, map_from_tag, covariance, entry.n_photos, entry.rms_px,
         visit=entry.visit, verdict=entry.verdict,
+        leave_one_out=None if spread[0] is None or spread[1] is None else (spread[0], math.radians(spread[1])),
+        size_from_map=None if size[0] is None or size[1] is None else (size[0], size[1]),
     )  # fmt: skip
 
 
@@ -94,7 +105,9 @@ def write_tags(path: Path, tags: TagMap) -> None:
                 t.rms_px,
                 t.verdict,
                 t.visit,
+                *((None, None) if t.leave_one_out is None else (t.leave_one_out[0], math.degrees(t.leave_one_out[1]))),
+                *(t.size_from_map or (None, None)),
             )
         )
-    photos = [_Photo(p.file, p.tag_id, p.used, p.reason, p.ambiguity, p.sigma, p.visit) for p in tags.photos]
+    photos = [_Photo(p.file, p.tag_id, p.used, p.reason, p.ambiguity, p.sigma, p.visit, p.flipped) for p in tags.photos]
     write_toml(path, _TagsFile(1, tags.map_digest, entries, photos))
