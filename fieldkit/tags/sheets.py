@@ -174,8 +174,9 @@ def _header(canvas: Canvas, page: _Page, family: str, tag_id: int) -> None:
     _text(canvas, left, top - 9, f"{family} \u00b7 id {tag_id}", size=19, bold=True)
     _text(canvas, right, top - 9, f"{_length(page.edge)} mm", size=19, bold=True, align="right")
     # Which way is up, for whoever hangs it
-    _arrow(canvas, page.width / 2, top - 11, page.width / 2, top - 4.5, head=2.6, width=0.9, colour=_GREY)
-    _text(canvas, page.width / 2, top - 14, "this side up", size=7, align="centre", colour=_GREY)
+    middle = page.width / 2
+    _arrow(canvas, middle - 8, top - 10, middle - 8, top - 4, head=2.6, width=0.9)
+    _text(canvas, middle - 5, top - 8.5, "this side up", size=8, colour=_GREY)
 
 
 def _centre_marks(canvas: Canvas, page: _Page) -> None:
@@ -216,7 +217,7 @@ def _footer(canvas: Canvas, page: _Page, family: str, tag_id: int) -> None:
     _text(canvas, x, y, f"AprilTag {family}, id {tag_id}", size=9, bold=True)
     lines = (
         f"size_m = {page.edge / 1e3:.6g}: the outer edge of the black square, between the arrows above.",
-        "Tag frame: origin where the four marks point, x to the right, y up, z out of the paper.",
+        "Tag frame: origin at the centre, where the marks point; x to the right, y up, z out of the paper.",
         "Print at 100 % (actual size, no fit to page), on stiff matt paper. Keep the white margin.",
         "Where the ruler is off, measure the black square and state what you measured.",
     )
