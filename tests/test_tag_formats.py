@@ -290,6 +290,8 @@ BUNDLE = "tag_bundles: [{name: a, layout: [{id: 1, size: 0.1%s}]}%s]\n"
         ("tagslam", "bodies: [{rig: {is_static: false, tags: [{id: 1}]}}]", r"no tag with a pose \(it moves"),
         ("tagslam", "other: 1", "missing required field `bodies`"),
         ("spot", "{", "not valid JSON"),
+        ("spot", "[" * 100_000, "not valid JSON"),
+        ("apriltag_ros", "tag_bundles: " + "[" * 2000, "not valid YAML"),
         ("spot", "{}", "no world_objects and no anchoring; expected JSON of Spot"),
         ("spot", '{"waypoints": [], "anchoring": {}}', r"no tag with a pose \(it lists none\)"),
         ("spot", '[{"apriltagProperties": {"tagId": "x"}}]', r"Expected `int`, got `str` - at .*tag_id`"),

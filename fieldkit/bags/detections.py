@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fieldkit.bags.content import stamp_ns
 from fieldkit.bags.files import BagFile
-from fieldkit.bags.reading import topic_list
+from fieldkit.bags.reading import open_source, topic_list
 from fieldkit.bags.tf import clean_frame
 from fieldkit.cameras import Camera
 from fieldkit.errors import BagError, FieldkitError
@@ -79,13 +79,13 @@ class RecordedTags:
 
 
 def read_detections(path: Path | str, *, topics: Sequence[str] | None = None) -> RecordedTags:
-    """Read recorded tag detections from a bag of any format; from all topics with a known type when none is named.
+    """Read tag detections from a recording of any format; from all topics with a known type when none is named.
 
     Known types: apriltag_msgs/ApriltagArrayStamped (TagSLAM), apriltag_msgs/AprilTagDetectionArray (apriltag_ros of
     ROS 2), and AprilTagDetectionArray of apriltag_ros, apriltags2_ros and apriltags_ros (ROS 1, poses only). Poses of
     bundles are left out and counted. Raises BagError when there is no such topic, or a named one is of another type.
     """
-    bag = BagFile(Path(path))
+    bag = open_source(path).bag
     known = {name: _READERS[topic.type] for name, topic in bag.topics.items() if topic.type in _READERS}
     for topic in topics or ():
         if topic not in known:

@@ -88,7 +88,7 @@ def read_yaml(path: Path, struct: type[T], *, what: str) -> T:
         raise StoreError(
             f"{path}: not valid YAML{place}: {problem}; expected {what}", hint="correct the file"
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not valid YAML: {error}; expected {what}", hint="correct the file") from error
     return convert(values, struct, path=path, what=what)
 

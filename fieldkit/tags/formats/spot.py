@@ -127,11 +127,11 @@ def read(path: Path, options: ImportOptions) -> Imported:
 
 
 def _values(path: Path) -> Any:
+    text = read_text(path, what=WHAT)
     try:
-        values = json.loads(read_text(path, what=WHAT))
-    except json.JSONDecodeError as error:
+        values = _snake(json.loads(text))
+    except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not valid JSON: {error}; expected {WHAT}", hint="check the file") from error
-    values = _snake(values)
     if isinstance(values, list):
         return {"world_objects": values}
     return {"anchoring": values} if isinstance(values, dict) and "objects" in values else values
