@@ -139,7 +139,8 @@ def flip(rng: np.random.Generator, scene: Scene, index: int) -> LocatedPhoto:
     turn = Rotation.from_rotvec(axis / max(float(np.linalg.norm(axis)), 1e-12) * angle)
     other = Pose.from_components(cam_from_tag.translation, turn * cam_from_tag.rotation)
     corners = PHOTO.project(other.apply(tag_corners(SIZE_M)))[0] + rng.normal(0, CORNER_PX, (4, 2))
-    return dataclasses.replace(photo, detections=(dataclasses.replace(photo.detections[0], corners_px=corners),))
+    flipped = dataclasses.replace(photo.detections[0], corners_px=corners)
+    return dataclasses.replace(photo, detections=(flipped, *photo.detections[1:]))
 
 
 def tilt_deg(scene: Scene, index: int) -> float:

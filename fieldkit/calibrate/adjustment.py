@@ -151,7 +151,10 @@ class FixedLandmarks:
             return self
         total = self.covariance.copy()
         for i in range(len(self.centre)):
-            total[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += (scale**2 - 1.0) * self.camera_covariance(i)
+            own = self.camera_covariance(i)
+            per_axis = np.repeat([np.trace(own[:3, :3]) / 3, np.trace(own[3:, 3:]) / 3], 3)
+            block = np.arange(6 * i, 6 * i + 6)
+            total[block, block] += (scale**2 - 1.0) * per_axis
         return FixedLandmarks(self.centre, _symmetric(np.linalg.inv(total)), self.chi2)
 
 

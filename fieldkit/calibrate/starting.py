@@ -109,7 +109,8 @@ def group(sighted: Sequence[Sighted], sizes_m: Mapping[int | None, float]) -> tu
 def _consensus(tag_id: int, family: str, visit: str | None, size_m: float, members: Sequence[Sighted]) -> Group:
     """Fuse sightings at the given size, and at the size that most photos agree on where they contradict each other."""
     sightings = [s.sighting for s in members]
-    fix, start_size_m = fuse_sightings(sightings, size_m, scales=PHOTO_SCALES), size_m
+    solutions, start_size_m = [s.solution for s in members], size_m
+    fix = fuse_sightings(sightings, size_m, scales=PHOTO_SCALES, solutions=solutions)
     if len(members) >= SIZE_VOTES and (not all(fix.used) or fix.scale > 1.0):
         ratio = likely_size_ratio(members)
         other = fuse_sightings(sightings, size_m * ratio, scales=PHOTO_SCALES) if ratio != 1.0 else fix

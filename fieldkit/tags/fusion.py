@@ -66,7 +66,13 @@ class TagFix:
         return self.evidence > CERTAIN and tilt_is_known(self.covariance)
 
 
-def fuse_sightings(sightings: Sequence[Sighting], size_m: float, *, scales: Sequence[float] = SCALES) -> TagFix:
+def fuse_sightings(
+    sightings: Sequence[Sighting],
+    size_m: float,
+    *,
+    scales: Sequence[float] = SCALES,
+    solutions: Sequence[TagSolution] | None = None,
+) -> TagFix:
     """Fuse sightings of one tag of edge ``size_m`` into ref_from_tag.
 
     Both planar solutions of every sighting vote for a consensus; then one generalised least-squares problem over all
@@ -74,13 +80,15 @@ def fuse_sightings(sightings: Sequence[Sighting], size_m: float, *, scales: Sequ
     camera pose, which is what solving for all camera poses as well, with their covariances as priors, gives after
     eliminating them. The camera noise may be multiplied by one of ``scales``, the most likely one (from 4 sightings
     on). The covariance is scaled by chi-square per degree of freedom where that exceeds 1. Errors that all sightings
-    share (hand-to-camera calibration, tag size, a warp of the map) are not in it.
+    share (hand-to-camera calibration, tag size, a warp of the map) are not in it. ``solutions`` are those of the
+    sightings by themselves, where they are known already.
     Raises TagError when there is no sighting, or no pose that explains them.
     """
     if not sightings:
         raise TagError("no sighting of the tag; expected at least one")
     try:
-        return _fuse(sightings, size_m, scales)
+        own = [solve(s.detection, s.camera, size_m) for s in sightings] if solutions is None else solutions
+        return _fuse(sightings, size_m, scales, own)
     except np.linalg.LinAlgError as error:
         raise TagError(
             f"the {len(sightings)} sightings of tag {sightings[0].detection.id} determine no pose ({error}); expected "
@@ -89,10 +97,11 @@ def fuse_sightings(sightings: Sequence[Sighting], size_m: float, *, scales: Sequ
         ) from error
 
 
-def _fuse(sightings: Sequence[Sighting], size_m: float, scales: Sequence[float]) -> TagFix:
+def _fuse(
+    sightings: Sequence[Sighting], size_m: float, scales: Sequence[float], solutions: Sequence[TagSolution]
+) -> TagFix:
     points = tag_corners(size_m)
     problem = _Problem.of(sightings, points)
-    solutions = [solve(s.detection, s.camera, size_m) for s in sightings]
     votes = _vote(sightings, solutions)
     scale = max(1.0, votes.scale) if max(scales) >= 1.0 else max(scales)
     best, used, scale = _settle(problem, votes.first, votes.agrees, scale, scales)

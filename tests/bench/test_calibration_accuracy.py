@@ -24,10 +24,9 @@ from calibration_scenes import SIZE_M, Scene, flip, localize_wrongly, photograph
 from fieldkit.calibrate.adjustment import Landmarks, adjust, adjust_cameras
 from fieldkit.calibrate.geometry import Poses
 from fieldkit.calibrate.locating import LocatedPhoto
-from fieldkit.calibrate.solving import solve_tags
+from fieldkit.calibrate.solving import SolvedTag, solve_tags
 from fieldkit.frames import Array, Pose, mean_pose, pose_error
 from fieldkit.frames import log as pose_log
-from fieldkit.tags import solve
 
 TRIALS = 400
 DRAWS = 50
@@ -75,7 +74,7 @@ def run(seed: int, make: Callable[[np.random.Generator], Scene], *, spoil: bool)
     return Trial(
         errors(tag.map_from_tag, true),
         errors(alone.map_from_tag, true),
-        errors(plain_mean(scene, photos), true),
+        errors(plain_mean(scene, photos, tag), true),
         rng.normal(size=(DRAWS, 6)) @ bound.T,
         error / np.sqrt(np.diag(tag.covariance)),
         float(error @ np.linalg.solve(tag.covariance, error)) / 6,
@@ -98,13 +97,14 @@ def crb(scene: Scene, left_out: set[int]) -> Array:
     return adjust(landmarks, corners, state, used=np.ones(len(corners), dtype=bool), iterations=0).tag_covariance(0)
 
 
-def plain_mean(scene: Scene, photos: list[LocatedPhoto]) -> Pose:
+def plain_mean(scene: Scene, photos: list[LocatedPhoto], tag: SolvedTag) -> Pose:
     """Return the mean of the photos' own tag poses, each localized by itself, as published pipelines take it."""
     poses = []
-    for photo in photos:
+    for sighting in tag.sightings:
+        photo = photos[sighting.sighted.photo]
         alone = Landmarks.of([(photo.landmark, photo.bearings)], scene.xyz, scene.covariance)
         cam = adjust_cameras(alone, Poses.of([photo.map_from_cam])).centre.pose(0)
-        poses.append(cam * solve(photo.detections[0], photo.camera, SIZE_M).cam_from_tag)
+        poses.append(cam * sighting.sighted.solution.cam_from_tag)
     return mean_pose(poses)[0]
 
 
