@@ -109,7 +109,7 @@ class Landmarks:
 
     def _coupling(self, by_camera: Array, by_landmark: Array, hessian: Array) -> tuple[scipy.sparse.csr_array, Array]:
         """Return W L^-T (6p, 3l) of the camera-landmark blocks W and the landmarks' Hessians L L^T, and L."""
-        root = np.linalg.cholesky(hessian)
+        root = np.asarray(np.linalg.cholesky(hessian), dtype=np.float64)
         block = by_camera.transpose(0, 2, 1) @ by_landmark
         block = np.linalg.solve(root[self.landmark], block.transpose(0, 2, 1)).transpose(0, 2, 1)
         rows = np.broadcast_to(6 * self.photo[:, None, None] + np.arange(6)[:, None], block.shape)
@@ -135,7 +135,7 @@ class FixedLandmarks:
     @functools.cached_property
     def covariance(self) -> Array:
         """The cameras' covariance f64[6p, 6p]."""
-        return _symmetric(np.linalg.inv(self.normal))
+        return _symmetric(np.asarray(np.linalg.inv(self.normal), dtype=np.float64))
 
     def camera_covariance(self, photo: int) -> Array:
         """Return the 6x6 covariance of one camera."""
@@ -155,7 +155,7 @@ class FixedLandmarks:
             per_axis = np.repeat([np.trace(own[:3, :3]) / 3, np.trace(own[3:, 3:]) / 3], 3)
             block = np.arange(6 * i, 6 * i + 6)
             total[block, block] += (scale**2 - 1.0) * per_axis
-        return FixedLandmarks(self.centre, _symmetric(np.linalg.inv(total)), self.chi2)
+        return FixedLandmarks(self.centre, _symmetric(np.asarray(np.linalg.inv(total), dtype=np.float64)), self.chi2)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -72,10 +72,6 @@ class Bearings:
     def __getitem__(self, rows: slice | NDArray[Any]) -> Bearings:
         return Bearings(self.xy[rows], self.whitening[rows])
 
-    def noisier(self, factor: float) -> Bearings:
-        """Return the same points with ``factor`` times the noise."""
-        return Bearings(self.xy, self.whitening / factor)
-
 
 def bearings(camera: Camera, pixels: ArrayLike, sigma_px: float) -> Bearings:
     """Return pixels (n, 2) of a camera, with ``sigma_px`` of noise per axis in the distorted image, as Bearings."""

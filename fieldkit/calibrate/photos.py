@@ -25,8 +25,11 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 MIN_CELL_PX = 3.0
 # Cells across a tag of a family without a closed black square
 PLAIN_CELLS = 8
-# A tag's edge is read half a cell to either side: a blur of a third of a cell brings the neighbours in
-MAX_BLUR_CELLS = 1 / 3
+# Edges are read half a cell to either side. In renders the corners err by more than three of their stated sigmas once
+# the blur exceeds this share of a cell: the neighbours come in
+MAX_BLUR_CELLS = 0.3
+# Share of pixels that lie on steep edges: of a tag, of a whole photo
+TAG_EDGES, PHOTO_EDGES = 0.005, 0.0002
 # Blur of a whole photo, in widths of it, that explains why nothing was found
 MAX_BLUR_WIDTHS = 1 / 300
 
@@ -214,22 +217,22 @@ def tag_blur_px(image: Image, detection: TagDetection) -> float:
     """Return the blur at a tag, as the standard deviation in pixels of a Gaussian; 0.8 px where it is sharp."""
     low = np.maximum(np.floor(detection.corners_px.min(axis=0)).astype(int) - 2, 0)
     high = np.ceil(detection.corners_px.max(axis=0)).astype(int) + 2
-    return _blur_px(image[low[1] : high[1], low[0] : high[0]])
+    return _blur_px(image[low[1] : high[1], low[0] : high[0]], TAG_EDGES)
 
 
 def describe_blur(image: Image) -> str:
     """Return words about a photo that is blurred all over, or nothing."""
-    blur = _blur_px(image)
+    blur = _blur_px(image, PHOTO_EDGES)
     blurred = MAX_BLUR_WIDTHS * image.shape[1] < blur < math.inf
     return f"; the photo is blurred by about {blur:.0f} px" if blurred else ""
 
 
-def _blur_px(image: Image) -> float:
+def _blur_px(image: Image, edges: float) -> float:
     """Estimate blur from the steepest edges: a step of height h, blurred by s, has the slope h / (s sqrt(2 pi))."""
     grey = image.astype(np.float32)
     slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8))
-    low, high = np.percentile(grey, (2, 98))
-    steepest = float(np.percentile(slope, 99.5))
+    low, high = np.quantile(grey, (4 * edges, 1 - 4 * edges))
+    steepest = float(np.quantile(slope, 1 - edges))
     return float(high - low) / (steepest * math.sqrt(2 * math.pi)) if steepest > 0 else math.inf
 
 

@@ -12,13 +12,14 @@ from fieldkit.calibrate.adjustment import (
     Adjusted,
     Corners,
     FixedLandmarks,
+    Ints,
     Landmarks,
     Mask,
     State,
     adjust_cameras,
 )
-from fieldkit.calibrate.agreement import agree, settle, without
-from fieldkit.calibrate.geometry import Bearings, Poses, bearings
+from fieldkit.calibrate.agreement import Agreement, agree, settle, without
+from fieldkit.calibrate.geometry import Poses, bearings
 from fieldkit.calibrate.locating import LocatedPhoto
 from fieldkit.calibrate.starting import Group, Homeless, Sighted, group, sight
 from fieldkit.frames import Array, Pose, compose_covariance, pose_error
@@ -34,15 +35,17 @@ FLIP_GATE = 33.4
 class SolvedSighting:
     """What became of one sighting: whether it entered, its deviation in sigmas per dimension, and its own pose.
 
-    ``alone`` is map_from_tag as this photo has it by itself, ``offset`` its distance (m) and angle (rad) from the
-    result. ``without`` is how far the result moves (m, rad) without this photo; None where nothing else holds the tag.
-    ``is_contradicted`` says that the photo's other tags do not fit it either: its landmarks do.
+    ``offset`` is the distance (m) and angle (rad) between the tag as this photo has it by itself and the result,
+    ``residual_px`` (8,) what remains in its corners; nan where the photo takes no part. ``without`` is how far the
+    result moves (m, rad) without this photo; None where nothing else holds the tag. ``is_contradicted`` says that the
+    photo is rejected at each of two or more tags that others see: not its corners are wrong, but where it is.
     """
 
     sighted: Sighted
     used: bool
     sigmas: float
     offset: tuple[float, float]
+    residual_px: Array
     flipped: bool
     without: tuple[float, float] | None = None
     is_contradicted: bool = False
@@ -87,12 +90,9 @@ class Solved:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Setting:
-    """All photos: what their landmarks say, the groups (t), and their sightings (c) in order."""
+class _Problem:
+    """What the landmarks of all photos say, the groups (t), and their sightings (c) in order."""
 
-    seen: Sequence[tuple[Array, Bearings]]
-    xyz: Array
-    covariance: Array
     fixed: FixedLandmarks
     groups: Sequence[Group]
     members: Sequence[Sighted]
@@ -107,22 +107,33 @@ def solve_tags(
 ) -> Solved:
     """Solve for the poses of all tags in localized photos, in a map with landmarks (l, 3) and covariances (l, 3, 3).
 
-    All that the landmarks' residuals exceed their noise by multiplies that noise at once, before any tag is looked at.
-    Raises TagError where sightings of a tag determine no pose.
+    First with all photos, to find those that agree; then with these alone, since a rejected one must not pull on the
+    landmarks either. Raises TagError where sightings of a tag determine no pose.
     """
-    rows = [p.landmark for p in photos]
-    landmarks = Landmarks.of([(r, p.bearings) for r, p in zip(rows, photos, strict=True)], xyz, covariance)
-    found = adjust_cameras(landmarks, Poses.of([p.map_from_cam for p in photos]))
-    excess = max(1.0, found.chi2 / max(landmarks.freedom, 1))
-    fixed = FixedLandmarks(found.centre, found.normal / excess, found.chi2 / excess)
+    fixed, _ = _landmarks(photos, xyz, covariance)
     poses = [fixed.centre.pose(i) for i in range(len(photos))]
     blocks = [fixed.camera_covariance(i) for i in range(len(photos))]
     groups, homeless = group(sight(photos, poses, blocks, sizes_m), sizes_m)
     members = [s for g in groups for s in g.members]
-    seen = [(r, p.bearings.noisier(math.sqrt(excess))) for r, p in zip(rows, photos, strict=True)]
-    setting = _Setting(seen, xyz, covariance * excess, fixed, groups, members, _corners(groups))
-    tags, scale = _solve(setting, [p.shared for p in photos])
-    return Solved(tuple(tags), tuple(homeless), scale * math.sqrt(excess))
+    problem = _Problem(fixed, groups, members, _corners(groups))
+    consensus: Mask = np.array([u for g in groups for u in g.fix.used], dtype=bool)
+    sizes = _measure_sizes(problem, consensus)
+    start = problem.start(sizes.solved_m)
+    agreed = agree(fixed, problem.corners, start, used=consensus, free_sizes=sizes.is_wrong)
+    kept = np.unique(problem.corners.photo[agreed.adjusted.used])
+    alone, excess = _landmarks([photos[i] for i in kept], xyz, covariance)
+    final, corners, rows = _settle(problem, agreed, kept, alone, sizes.is_wrong)
+    sightings = _sightings(problem, agreed, final, corners, rows)
+    tags = [_tag(t, problem, final, sightings, [p.shared for p in photos], sizes.of(t)) for t in range(len(groups))]
+    return Solved(tuple(tags), tuple(homeless), final.scale * math.sqrt(excess))
+
+
+def _landmarks(photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array) -> tuple[FixedLandmarks, float]:
+    """Return what the landmarks say about the photos, and the factor of their variance that residuals show, from 1."""
+    landmarks = Landmarks.of([(p.landmark, p.bearings) for p in photos], xyz, covariance)
+    found = adjust_cameras(landmarks, Poses.of([p.map_from_cam for p in photos]))
+    excess = max(1.0, found.chi2 / max(landmarks.freedom, 1))
+    return FixedLandmarks(found.centre, found.normal / excess, found.chi2 / excess), excess
 
 
 def _corners(groups: Sequence[Group]) -> Corners:
@@ -134,58 +145,22 @@ def _corners(groups: Sequence[Group]) -> Corners:
     return Corners.of(sightings)
 
 
-def _solve(setting: _Setting, shared: Sequence[Array]) -> tuple[list[SolvedTag], float]:
-    groups, corners = setting.groups, setting.corners
-    consensus: Mask = np.array([u for g in groups for u in g.fix.used], dtype=bool)
-    sizes = _measure_sizes(setting, consensus)
-    agreed = agree(setting.fixed, corners, setting.start(sizes.solved_m), used=consensus, free_sizes=sizes.is_wrong)
-    # Once more with the photos that agree alone: rejected ones must not pull on the landmarks either
-    kept = np.unique(corners.photo[agreed.adjusted.used])
-    rows = np.isin(corners.photo, kept)
-    state = agreed.adjusted.state
+def _settle(
+    problem: _Problem, agreed: Agreement, kept: Ints, alone: FixedLandmarks, free_sizes: Mask
+) -> tuple[Agreement, Corners, Mask]:
+    """Solve with the photos that agree alone; also return their sightings, and which (c) of all these are."""
+    every, state = problem.corners, agreed.adjusted.state
+    rows: Mask = np.isin(every.photo, kept)
+    corners = Corners(np.searchsorted(kept, every.photo[rows]), every.tag[rows], every.bearings[rows])
     final = settle(
-        adjust_cameras(
-            Landmarks.of([setting.seen[i] for i in kept], setting.xyz, setting.covariance), state.cameras[kept]
-        ),
-        Corners(np.searchsorted(kept, corners.photo[rows]), corners.tag[rows], corners.bearings[rows]),
-        State(state.cameras[kept], state.tags, state.sizes_m),
+        alone,
+        corners,
+        State(alone.centre, state.tags, state.sizes_m),
         used=agreed.adjusted.used[rows],
         scale=agreed.scale,
-        free_sizes=sizes.is_wrong,
+        free_sizes=free_sizes,
     )
-    sigmas = agreed.sigmas
-    sigmas[rows] = final.sigmas
-    used = agreed.adjusted.used
-    moved = np.full((len(corners), 2), np.nan)
-    moved[rows] = _moved_without(final.adjusted, np.searchsorted(kept, corners.photo[rows]), corners.tag[rows])
-    residual = np.zeros((len(corners), 8))
-    residual[rows] = final.adjusted.residual
-    tags = []
-    for t in range(len(groups)):
-        members = np.flatnonzero(corners.tag == t)
-        noise = np.array([[setting.members[c].sighting.detection.sigma_px] for c in members if used[c]])
-        map_from_tag = final.adjusted.state.tags.pose(t)
-        covariance = final.adjusted.tag_covariance(t) * final.inflation
-        common = [shared[setting.members[c].photo] for c in members if used[c]]
-        cams = [setting.members[c].sighting.ref_from_cam for c in members if used[c]]
-        sightings = tuple(
-            _sighting(
-                setting.members[c], map_from_tag, covariance, bool(used[c]), float(sigmas[c]), moved[c],
-                _is_contradicted(corners, used, c),
-            )
-            for c in members
-        )  # fmt: skip
-        tags.append(
-            SolvedTag(
-                groups[t],
-                map_from_tag,
-                covariance + _common(common, cams, map_from_tag),
-                float(np.sqrt(np.mean((residual[members[used[members]]] * noise) ** 2))),
-                sightings,
-                sizes.of(t),
-            )
-        )
-    return tags, final.scale
+    return final, corners, rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,20 +178,82 @@ class _Sizes:
         return SizeCheck(float(self.measured_m[tag]), float(self.sigma[tag]), bool(self.is_wrong[tag]))
 
 
-def _measure_sizes(setting: _Setting, consensus: Mask) -> _Sizes:
+def _measure_sizes(problem: _Problem, consensus: Mask) -> _Sizes:
     """Solve with every tag's size free: what the map's scale says about it."""
-    n = len(setting.groups)
-    given = np.array([g.size_m for g in setting.groups])
-    start = setting.start(np.array([g.start_size_m for g in setting.groups]))
-    free = agree(setting.fixed, setting.corners, start, used=consensus, free_sizes=np.ones(n, dtype=bool))
+    n = len(problem.groups)
+    given = np.array([g.size_m for g in problem.groups])
+    start = problem.start(np.array([g.start_size_m for g in problem.groups]))
+    free = agree(problem.fixed, problem.corners, start, used=consensus, free_sizes=np.ones(n, dtype=bool))
     sigma = np.sqrt(np.diag(free.adjusted.covariance)[-n:] * free.inflation)
     measured = free.adjusted.state.sizes_m
     deviation = np.abs(np.log(measured / given))
     return _Sizes(measured, sigma, (deviation > SIZE_SIGMAS * sigma) & (deviation > SIZE_SHARE), given)
 
 
-def _moved_without(adjusted: Adjusted, photo: Array, tag: Array) -> Array:
-    """Return how far (m, rad) each sighting's tag moves when the sighting's photo is left out; nan where it must not."""
+def _sightings(
+    problem: _Problem, agreed: Agreement, final: Agreement, corners: Corners, rows: Mask
+) -> list[SolvedSighting]:
+    """Return what became of every sighting (c)."""
+    used, every = agreed.adjusted.used, problem.corners
+    sigmas = agreed.sigmas
+    sigmas[rows] = final.sigmas
+    moved = np.full((len(every), 2), np.nan)
+    moved[rows] = _moved_without(final.adjusted, corners)
+    residual = np.full((len(every), 8), np.nan)
+    residual[rows] = final.adjusted.residual
+    seen_by = np.bincount(every.tag)
+    result = []
+    for c, sighted in enumerate(problem.members):
+        others = (every.photo == every.photo[c]) & (seen_by[every.tag] > 1)
+        tag = int(every.tag[c])
+        map_from_tag, covariance = final.adjusted.state.tags.pose(tag), final.adjusted.tag_covariance(tag)
+        result.append(
+            SolvedSighting(
+                sighted,
+                bool(used[c]),
+                float(sigmas[c]),
+                pose_error(sighted.sighting.ref_from_cam * sighted.solution.cam_from_tag, map_from_tag),
+                residual[c] * sighted.sighting.detection.sigma_px,
+                _is_flipped(sighted, map_from_tag, None if used[c] else covariance),
+                None if np.isnan(moved[c, 0]) else (float(moved[c, 0]), float(moved[c, 1])),
+                int(others.sum()) > 1 and not bool(used[others].any()),
+            )
+        )
+    return result
+
+
+def _tag(
+    tag: int,
+    problem: _Problem,
+    final: Agreement,
+    sightings: Sequence[SolvedSighting],
+    shared: Sequence[Array],
+    size: SizeCheck,
+) -> SolvedTag:
+    own = [s for s, t in zip(sightings, problem.corners.tag, strict=True) if t == tag]
+    map_from_tag = final.adjusted.state.tags.pose(tag)
+    # What photos are wrong by together is carried to the tag once: the mean over photos, not divided by their number
+    common = np.mean(
+        [
+            compose_covariance(shared[s.sighted.photo], s.sighted.sighting.ref_from_cam.inv() * map_from_tag)
+            for s in own
+            if s.used
+        ],
+        axis=0,
+    )
+    return SolvedTag(
+        problem.groups[tag],
+        map_from_tag,
+        final.adjusted.tag_covariance(tag) * final.inflation + common,
+        float(np.sqrt(np.mean([s.residual_px**2 for s in own if s.used]))),
+        tuple(own),
+        size,
+    )
+
+
+def _moved_without(adjusted: Adjusted, corners: Corners) -> Array:
+    """Return how far (m, rad) a sighting's tag moves without its photo, (c, 2); nan where nothing else holds it."""
+    photo, tag = corners.photo, corners.tag
     result = np.full((len(photo), 2), np.nan)
     n_used = np.bincount(tag[adjusted.used], minlength=len(adjusted.state.tags))
     for i in np.unique(photo[adjusted.used]):
@@ -231,41 +268,20 @@ def _moved_without(adjusted: Adjusted, photo: Array, tag: Array) -> Array:
     return result
 
 
-def _is_contradicted(corners: Corners, used: Mask, c: int) -> bool:
-    """Tell whether a photo is rejected at every tag, two or more, that others see."""
-    seen_by = np.bincount(corners.tag)
-    rows = (corners.photo == corners.photo[c]) & (seen_by[corners.tag] > 1)
-    return int(rows.sum()) > 1 and not bool(used[rows].any())
+def _is_flipped(sighted: Sighted, map_from_tag: Pose, covariance: Array | None) -> bool:
+    """Tell whether a photo by itself prefers the other planar solution of a tag.
 
-
-def _common(shared: Sequence[Array], cams: Sequence[Pose], map_from_tag: Pose) -> Array:
-    """Return the mean covariance that photos carry to a tag from what they are wrong by together: once, not divided."""
-    carried = [compose_covariance(s, cam.inv() * map_from_tag) for s, cam in zip(shared, cams, strict=True)]
-    return np.asarray(np.mean(carried, axis=0))
-
-
-def _sighting(
-    sighted: Sighted,
-    map_from_tag: Pose,
-    covariance: Array,
-    used: bool,
-    sigmas: float,
-    moved: Array,
-    is_contradicted: bool,
-) -> SolvedSighting:
+    Of a rejected photo (with the tag's covariance) the other solution must be the tag: one that is localized wrongly
+    may come closer with its other solution, but does not agree.
+    """
     cam, solution = sighted.sighting.ref_from_cam, sighted.solution
-    own, flipped = cam * solution.cam_from_tag, False
-    if solution.alternative is not None and solution.alternative_covariance is not None:
-        other = cam * solution.alternative
-        flipped = pose_error(other, map_from_tag)[1] < pose_error(own, map_from_tag)[1]
-        if not used:
-            # A photo that is localized wrongly may come closer with its other solution, but not agree
-            total = compose_covariance(
-                sighted.sighting.covariance, solution.alternative, solution.alternative_covariance
-            )
-            delta = pose_log(other.inv() * map_from_tag)
-            flipped &= bool(delta @ np.linalg.solve(total + covariance, delta) < FLIP_GATE)
-    without_it = None if np.isnan(moved[0]) else (float(moved[0]), float(moved[1]))
-    return SolvedSighting(
-        sighted, used, sigmas, pose_error(own, map_from_tag), flipped, without_it, is_contradicted and not used
-    )
+    if solution.alternative is None or solution.alternative_covariance is None:
+        return False
+    own, other = cam * solution.cam_from_tag, cam * solution.alternative
+    if pose_error(other, map_from_tag)[1] >= pose_error(own, map_from_tag)[1]:
+        return False
+    if covariance is None:
+        return True
+    total = compose_covariance(sighted.sighting.covariance, solution.alternative, solution.alternative_covariance)
+    delta = pose_log(other.inv() * map_from_tag)
+    return bool(delta @ np.linalg.solve(total + covariance, delta) < FLIP_GATE)

@@ -19,13 +19,15 @@ log = logging.getLogger(__name__)
 WARN_SIGMA_M, WARN_SIGMA_RAD = 0.01, math.radians(0.5)
 # A size that is wrong by more than this share makes the tag useless; below, the map's scale may be what is wrong
 FAIL_SIZE_SHARE = 0.03
+# A size that photos show no better than this is not shown
+SHOWN_SIZE_SHARE = 0.1
 # Fewer photos cannot outvote a wrong one
 ENOUGH_PHOTOS = 3
 
 
 def tag_pose(tag: SolvedTag) -> TagPose:
     """Return a solved tag as it is stored."""
-    group = tag.group
+    group, size = tag.group, tag.size
     return TagPose(
         group.tag_id,
         group.family,
@@ -37,7 +39,7 @@ def tag_pose(tag: SolvedTag) -> TagPose:
         visit=group.visit,
         verdict=judge(tag),
         leave_one_out=leave_one_out(tag.sightings),
-        size_from_map=(tag.size.measured_m, tag.size.measured_m * tag.size.sigma),
+        size_from_map=(size.measured_m, size.measured_m * size.sigma) if size.sigma < SHOWN_SIZE_SHARE else None,
     )
 
 
