@@ -81,6 +81,22 @@ def test_a_photo_localized_wrongly_is_told_from_a_wrong_tag_where_it_sees_two() 
     assert all(r.endswith("the photo is localized wrongly") for r in reasons.values())
 
 
+def test_a_tag_that_only_a_wrong_photo_sees_fails() -> None:
+    of = scene(3, tags=TWO_TAGS)
+    wrong = localize_wrongly(np.random.default_rng(3), of, 1, distance_m=0.5)
+    photos = [wrong if i == 1 else dataclasses.replace(p, detections=p.detections[:1]) for i, p in enumerate(of.photos)]
+    solved = solve(of, photos)
+    assert [judge(t) for t in solved.tags] == ["pass", "fail"]
+    assert list(rejected(solved, photos)) == [("1.jpg", 0)]
+
+
+def test_landmarks_that_fix_no_camera_are_an_error() -> None:
+    of = scene(3)
+    few = [dataclasses.replace(p, landmark=p.landmark[:1], bearings=p.bearings[:1]) for p in of.photos]
+    with pytest.raises(TagError, match=r"the 6 localized photos determine no pose \(the landmarks in 0\.jpg leave it open\)"):
+        solve(of, few)
+
+
 def test_one_bad_set_of_corners_leaves_the_photos_other_tag_in() -> None:
     of = scene(4, tags=TWO_TAGS)
     first, second = of.photos[3].detections

@@ -278,6 +278,21 @@ def test_tags_read_back(tmp_path: Path) -> None:
     assert back.find(2, visit="w02") is None
 
 
+def test_what_a_calibration_found_out_reads_back_and_may_be_missing(tmp_path: Path) -> None:
+    plain = TagPose(2, "tag36h11", 0.1365, yaw_pose([1, 2, 3], 0.4), np.eye(6), 6, 0.3)
+    full = dataclasses.replace(plain, id=3, leave_one_out=(0.002, 0.01), size_from_map=(0.1371, 0.0002))
+    photo = TagPhoto("a.jpg", 3, True, flipped=True)
+    path = tmp_path / "tags.toml"
+    store.write_tags(path, TagMap((plain, full), (photo,), "digest"))
+    back = store.read_tags(path)
+    assert back.photos == (photo,)
+    assert (back.tags[0].leave_one_out, back.tags[0].size_from_map) == (None, None)
+    assert back.tags[1].leave_one_out == pytest.approx((0.002, 0.01))
+    assert back.tags[1].size_from_map == (0.1371, 0.0002)
+    path.write_text(path.read_text().replace("flipped = true\n", ""))
+    assert not store.read_tags(path).photos[0].flipped
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

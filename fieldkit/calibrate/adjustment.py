@@ -110,8 +110,8 @@ class Landmarks:
     def _coupling(self, by_camera: Array, by_landmark: Array, hessian: Array) -> tuple[scipy.sparse.csr_array, Array]:
         """Return W L^-T (6p, 3l) of the camera-landmark blocks W and the landmarks' Hessians L L^T, and L."""
         root = np.asarray(np.linalg.cholesky(hessian), dtype=np.float64)
-        block = by_camera.transpose(0, 2, 1) @ by_landmark
-        block = np.linalg.solve(root[self.landmark], block.transpose(0, 2, 1)).transpose(0, 2, 1)
+        mixed = by_landmark.transpose(0, 2, 1) @ by_camera
+        block = np.asarray(np.linalg.solve(root[self.landmark], mixed), dtype=np.float64).transpose(0, 2, 1)
         rows = np.broadcast_to(6 * self.photo[:, None, None] + np.arange(6)[:, None], block.shape)
         columns = np.broadcast_to(3 * self.landmark[:, None, None] + np.arange(3), block.shape)
         shape = (6 * self.n_photos, 3 * len(self.xyz))

@@ -25,6 +25,8 @@ Progress = Callable[[str, int, int], None]
 FOCAL_RATIO = 1.5
 # Squared deviation of a match (2 degrees of freedom) beyond which it is a wrong one: one right match in a thousand
 MATCH_GATE = 13.8
+# Fewer leave a pose nearly undetermined
+MIN_MATCHES = 8
 # Median of chi-square with 2 degrees of freedom
 MEDIAN_CHI2 = 1.386
 
@@ -67,6 +69,10 @@ def locate(
             failed += [TagPhoto(photo.file, d.id, used=False, reason=reason, visit=photo.visit) for d in shot.usable]
             continue
         landmark, seen = right_matches(inliers, camera, estimate.map_from_cam, scene_map)
+        if len(landmark) < MIN_MATCHES:
+            reason = f"not localized ({len(landmark)} of {estimate.n_inliers} inliers fit their noise)"
+            failed += [TagPhoto(photo.file, d.id, used=False, reason=reason, visit=photo.visit) for d in shot.usable]
+            continue
         located.append(
             LocatedPhoto(
                 photo.file, photo.visit, photo.camera, estimate.map_from_cam, inliers.shared, landmark, seen,

@@ -22,11 +22,14 @@ from fieldkit.calibrate.agreement import Agreement, agree, settle, without
 from fieldkit.calibrate.geometry import Poses, bearings
 from fieldkit.calibrate.locating import LocatedPhoto
 from fieldkit.calibrate.starting import Group, Homeless, Sighted, group, sight
+from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, compose_covariance, pose_error
 from fieldkit.frames import log as pose_log
 
 # A tag's size is wrong where the map's scale says so by that many sigmas, and by at least this share
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 0.005
+# A photo known no better than this is not localized
+LOST_SIGMA_M = 10.0
 # Squared deviation (6 degrees of freedom) up to which a rejected sighting's other solution is the tag: one in 10^5
 FLIP_GATE = 33.4
 
@@ -38,7 +41,7 @@ class SolvedSighting:
     ``offset`` is the distance (m) and angle (rad) between the tag as this photo has it by itself and the result,
     ``residual_px`` (8,) what remains in its corners; nan where the photo takes no part. ``without`` is how far the
     result moves (m, rad) without this photo; None where nothing else holds the tag. ``is_contradicted`` says that the
-    photo is rejected at each of two or more tags that others see: not its corners are wrong, but where it is.
+    photo is rejected at every other tag that others see too: not its corners are wrong, but where it is.
     """
 
     sighted: Sighted
@@ -108,8 +111,20 @@ def solve_tags(
     """Solve for the poses of all tags in localized photos, in a map with landmarks (l, 3) and covariances (l, 3, 3).
 
     First with all photos, to find those that agree; then with these alone, since a rejected one must not pull on the
-    landmarks either. Raises TagError where sightings of a tag determine no pose.
+    landmarks either. Raises TagError where the photos determine no pose.
     """
+    try:
+        return _solve(photos, xyz, covariance, sizes_m)
+    except np.linalg.LinAlgError as error:
+        raise TagError(
+            f"the {len(photos)} localized photos determine no pose ({error}); expected landmarks all over each photo",
+            hint="take photos that show the tag and much of its mapped surroundings",
+        ) from error
+
+
+def _solve(
+    photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array, sizes_m: Mapping[int | None, float]
+) -> Solved:
     fixed, _ = _landmarks(photos, xyz, covariance)
     poses = [fixed.centre.pose(i) for i in range(len(photos))]
     blocks = [fixed.camera_covariance(i) for i in range(len(photos))]
@@ -133,7 +148,12 @@ def _landmarks(photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array) ->
     landmarks = Landmarks.of([(p.landmark, p.bearings) for p in photos], xyz, covariance)
     found = adjust_cameras(landmarks, Poses.of([p.map_from_cam for p in photos]))
     excess = max(1.0, found.chi2 / max(landmarks.freedom, 1))
-    return FixedLandmarks(found.centre, found.normal / excess, found.chi2 / excess), excess
+    fixed = FixedLandmarks(found.centre, found.normal / excess, found.chi2 / excess)
+    for i, photo in enumerate(photos):
+        variance = float(np.trace(fixed.camera_covariance(i)[3:, 3:]))
+        if not 0.0 < variance < LOST_SIGMA_M**2:
+            raise np.linalg.LinAlgError(f"the landmarks in {photo.file} leave it open")
+    return fixed, excess
 
 
 def _corners(groups: Sequence[Group]) -> Corners:
@@ -216,7 +236,7 @@ def _sightings(
                 residual[c] * sighted.sighting.detection.sigma_px,
                 _is_flipped(sighted, map_from_tag, None if used[c] else covariance),
                 None if np.isnan(moved[c, 0]) else (float(moved[c, 0]), float(moved[c, 1])),
-                int(others.sum()) > 1 and not bool(used[others].any()),
+                int(others.sum()) > int(not used[c]) and not bool(used[others].any()),
             )
         )
     return result

@@ -46,12 +46,14 @@ def tag_pose(tag: SolvedTag) -> TagPose:
 def judge(tag: SolvedTag) -> Literal["pass", "warn", "fail"]:
     """Judge a tag.
 
-    Fail: no two photos agree, or its size contradicts the map by more than 3 %. Warn: a reader should look at the
+    Fail: no two photos agree, its size contradicts the map by more than 3 %, or every photo of it is rejected at its
+    other tags. Warn: a reader should look at the
     photos, since few are used, many rejected, the tilt is open, or the pose is uncertain or depends on one photo.
     """
     used, count = tag.n_used, len(tag.sightings)
     off = abs(math.log(tag.size.measured_m / tag.group.size_m))
-    if (used == 1 and count > 1) or (tag.size.is_wrong and off > FAIL_SIZE_SHARE):
+    doubted = all(s.is_contradicted for s in tag.sightings if s.used)
+    if (used == 1 and count > 1) or (tag.size.is_wrong and off > FAIL_SIZE_SHARE) or doubted:
         return "fail"
     sigma = np.sqrt(np.diag(tag.covariance))
     doubtful = used < ENOUGH_PHOTOS or 3 * (count - used) > count or not tag.group.fix.is_certain or tag.size.is_wrong
