@@ -107,10 +107,10 @@ def _fuse(
     best, used, scale = _settle(problem, votes.first, votes.agrees, scale, scales)
     chi2 = problem.chi2(best, scale)
     factor = max(1.0, float(chi2[used].sum()) / max(8 * int(used.sum()) - 6, 1))
-    covariance = np.linalg.inv(problem.information(best, used, scale)) * factor
+    covariance = _covariance(problem.information(best, used, scale)) * factor
     fix = TagFix(
         best,
-        (covariance + covariance.T) / 2,
+        covariance,
         problem.rms_px(best, used, scale),
         tuple(bool(u) for u in used),
         tuple(float(np.sqrt(c / 8)) for c in chi2),
@@ -308,15 +308,27 @@ def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], us
         if (fix.ref_from_tag.inv() * other).rotation.magnitude() < 0.02:
             continue
         cost = float(problem.chi2(other, fix.scale)[used].sum())
-        covariance = np.linalg.inv(problem.information(other, used, fix.scale)) * factor
+        try:
+            covariance = _covariance(problem.information(other, used, fix.scale)) * factor
+        except np.linalg.LinAlgError:
+            continue
         return dataclasses.replace(
             fix,
             alternative=other,
-            alternative_covariance=(covariance + covariance.T) / 2,
+            alternative_covariance=covariance,
             ambiguity=float(np.sqrt(min(best, cost) / max(best, cost, 1e-12))),
             evidence=(cost - best) / factor,
         )
     return fix
+
+
+def _covariance(information: Array) -> Array:
+    """Return the inverse; raises LinAlgError where rounding leaves it not positive definite."""
+    covariance: Array = np.linalg.inv(information)
+    covariance = (covariance + covariance.T) / 2
+    if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
+        raise np.linalg.LinAlgError("covariance not positive definite")
+    return covariance
 
 
 def _is_flipped(sighting: Sighting, solution: TagSolution, ref_from_tag: Pose) -> bool:

@@ -128,6 +128,7 @@ def _planar(xy: Array, points: Array) -> list[Pose]:
 def _refine(start: Pose, xy: Array, points: Array, focal: Array) -> tuple[Pose, Array, Array]:
     """Minimise the pixel residuals by Levenberg-Marquardt; return pose, residuals (8,) and Jacobian (8, 6)."""
     cam_from_tag, damping = start, 1e-6
+    unit = np.repeat([1.0, float(np.linalg.norm(start.translation))], 3)
     predicted, derivative = project_tag(cam_from_tag, points, focal)
     residual, jacobian = (xy * focal - predicted).ravel(), derivative.reshape(-1, 6)
     for _ in range(30):
@@ -142,7 +143,7 @@ def _refine(start: Pose, xy: Array, points: Array, focal: Array) -> tuple[Pose, 
             damping = max(damping / 10, 1e-12)
             if gain < 1e-14:
                 break
-        elif damping > 1e6 or float(np.abs(step).max()) < 1e-13:
+        elif damping > 1e6 or float(np.abs(step / unit).max()) < 1e-9:
             break
         else:
             damping *= 10
