@@ -324,8 +324,8 @@ def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], us
 
 def _covariance(information: Array) -> Array:
     """Return the inverse; raises LinAlgError where rounding leaves it not positive definite."""
-    covariance: Array = np.linalg.inv(information)
-    covariance = (covariance + covariance.T) / 2
+    inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    covariance = (inverse + inverse.T) / 2
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         raise np.linalg.LinAlgError("covariance not positive definite")
     return covariance
