@@ -186,6 +186,18 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_scene_without_room_or_a_mesh_that_cannot_be_read_leaves_nothing(tmp_path: Path) -> None:
+    hall = trimesh.creation.box((6.0, 5.0, 2.8))
+    hall.vertices[0] = np.nan
+    hall.export(tmp_path / "nan.ply")
+    out = tmp_path / "set"
+    with pytest.raises(FieldkitError, match=r"nan: .*nan\.ply"):
+        make_scenes(["room", str(tmp_path / "nan.ply")], out, options=DatasetOptions(waypoints=2, views=2))
+    with pytest.raises(FieldkitError, match=r"room: .*ask for fewer waypoints"):
+        make_scenes(["room"], out, options=DatasetOptions(waypoints=9000))
+    assert not out.exists()
+
+
 def test_the_command_says_a_mistake_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["dataset", "--scenes", "rom", "--out", str(tmp_path / "set")])
