@@ -121,7 +121,7 @@ def dataset(
     A killed run goes on with the same command. Replay it with `fieldkit replay OUT --protocol paper_sim --out RUN`.
 
     Args:
-        scenes: names of scenes, or meshes of buildings: .glb, .obj or .ply files
+        scenes: names of scenes, or meshes of buildings: .glb, .obj or .ply files; they join those that OUT holds
         out: dataset folder to write, or to go on with
         seed: the same seed gives the same bytes
         waypoints: places per scene
@@ -133,7 +133,8 @@ def dataset(
         repeat_share: share of the views that are localized again
         unit: unit of the meshes; by default they have to look like metres
         up: axis of the meshes that points up; by default it has to look like z
-        force: make the views again where settings differ; maps that still fit are kept
+        force: make the views of these scenes again where they were made otherwise; maps that still fit are kept, and
+            scenes of OUT that are not named stay: settings other than theirs are refused
     """
     from sim_bridge.dataset import DatasetOptions, make_scenes
     from sim_bridge.importing import MeshOptions
