@@ -17,6 +17,7 @@ from fieldkit.errors import FieldkitError
 
 if TYPE_CHECKING:
     from fieldkit.dataset import Progress
+    from sim_bridge.importing import MeshOptions
 
 # The simulator itself is imported inside the command: --help must not wait for a compiler.
 
@@ -64,7 +65,6 @@ def synthesize(
         force: replace an existing folder
     """
     from sim_bridge.errors import SynthesisError
-    from sim_bridge.importing import MeshOptions
     from sim_bridge.mapping.lenses import refuse_lenses
     from sim_bridge.recording.recorder import own_format
     from sim_bridge.scenes.changes import find_changes
@@ -93,7 +93,7 @@ def synthesize(
         recorder=dataclasses.replace(standard.recorder, layout=layout),
         sensors=chosen,
         changes=find_changes(changes),
-        mesh=MeshOptions(up=up, unit=unit),
+        mesh=_mesh_options((scene,), unit=unit, up=up),
     )
     begin = time.monotonic()
     write_session(scene, out, seed=seed, formats=format or (own_format(layout),), options=options, force=force)
@@ -137,12 +137,11 @@ def dataset(
             scenes of OUT that are not named stay: settings other than theirs are refused
     """
     from sim_bridge.dataset import DatasetOptions, make_scenes
-    from sim_bridge.importing import MeshOptions
     from sim_bridge.mapping.lenses import refuse_lenses
     from sim_bridge.sensors import load_sensors
 
     refuse_lenses(load_sensors(sensors), where=sensors)
-    mesh = MeshOptions(up=up, unit=unit)
+    mesh = _mesh_options(scenes, unit=unit, up=up)
     options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh)
     made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())
     for row in made:
@@ -151,6 +150,22 @@ def dataset(
             f"{row.scene}: {row.waypoints} of {row.planned} waypoints, {row.views} views, "
             f"{100 * row.localized:.1f} % localize{again}"
         )
+
+
+def _mesh_options(
+    scenes: tuple[str, ...], *, unit: Literal["m", "cm", "mm"] | None, up: Literal["z", "y"] | None
+) -> MeshOptions:
+    """Return how meshes are to be read; raises SynthesisError where that is said and there is none."""
+    from sim_bridge.errors import SynthesisError
+    from sim_bridge.importing import MeshOptions, is_mesh
+
+    for flag, value in (("unit", unit), ("up", up)):
+        if value is not None and not any(is_mesh(scene) for scene in scenes):
+            raise SynthesisError(
+                f"--{flag} {value}: no scene is a mesh ({', '.join(scenes)}); expected a .glb, .obj or .ply file",
+                hint=f"leave --{flag} out, or give a mesh's path",
+            )
+    return MeshOptions(up=up, unit=unit)
 
 
 class _ProgressLines:
