@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
 
@@ -14,8 +15,10 @@ from PIL import Image
 from fieldkit.cameras import Camera
 from sim_bridge import cli
 from sim_bridge.aim import aim
+from sim_bridge.dataset import DatasetOptions, make_scenes
 from sim_bridge.errors import SynthesisError
 from sim_bridge.importing import MeshOptions, import_scene
+from sim_bridge.importing.colours import GREY
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
 from sim_bridge.stage import staging, tours
@@ -57,6 +60,18 @@ def checks(px: int = 64) -> Image.Image:
     image[half:, :half] = (0, 0, 250)
     image[half:, half:] = (250, 250, 250)
     return Image.fromarray(image)
+
+
+def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
+    """A closed box seen from outside."""
+    return trimesh.creation.box(bounds=[low, high])
+
+
+def hall(length: float, width: float, height: float) -> trimesh.Trimesh:
+    """A closed box seen from inside."""
+    room = block((0.0, 0.0, 0.0), (length, width, height))
+    room.invert()
+    return room
 
 
 def painted(parts: list[trimesh.Trimesh], image: Image.Image | None = None) -> list[trimesh.Trimesh]:
@@ -104,7 +119,18 @@ def test_textures_lie_as_they_were_drawn(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
 def test_vertex_colours_are_seen(tmp_path: Path, kind: str) -> None:
-    seen = looking_north(import_scene(saved(tmp_path / f"room.{kind}", coloured(shell(), (200, 120, 40)))))
+    # glTF's colours are linear: these are 200, 120, 40 encoded.
+    stored = (147, 48, 5) if kind == "glb" else (200, 120, 40)
+    seen = looking_north(import_scene(saved(tmp_path / f"room.{kind}", coloured(shell(), stored))))
+    assert np.abs(seen[20:80, 20:140].astype(int) - (200, 120, 40)).max() <= 3
+
+
+def test_vertex_colours_beside_a_plain_material_are_seen(tmp_path: Path) -> None:
+    parts = shell()
+    for part in parts:
+        part.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(name="plain"))
+        part.visual.vertex_attributes["color"] = np.tile((147, 48, 5, 255), (4, 1)).astype(np.uint8)
+    seen = looking_north(import_scene(saved(tmp_path / "room.glb", parts)))
     assert np.abs(seen[20:80, 20:140].astype(int) - (200, 120, 40)).max() <= 3
 
 
@@ -212,6 +238,30 @@ def test_missing_textures_are_grey_and_said_once(tmp_path: Path, caplog: pytest.
     assert 100 < wall.mean() < 200
 
 
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+def test_what_names_a_file_that_is_not_there_is_grey_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str
+) -> None:
+    path = tmp_path / f"room.{kind}"
+    room = trimesh.util.concatenate(shell())
+    if kind == "obj":
+        saved(path, painted([room]))
+        for material in tmp_path.glob("*.mtl"):
+            material.unlink()
+    else:
+        rows = [f"{x} {y} {z} {u} {v}" for (x, y, z), (u, v) in zip(room.vertices, room.visual.uv, strict=True)]
+        properties = "".join(f"property float {name}\n" for name in "xyzst")
+        path.write_text(
+            f"ply\nformat ascii 1.0\ncomment TextureFile gone.png\nelement vertex {len(rows)}\n{properties}"
+            f"element face {len(room.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+            + "\n".join(rows + [f"3 {a} {b} {c}" for a, b, c in room.faces])
+        )
+    with caplog.at_level(logging.WARNING):
+        scene = import_scene(path)
+    assert len([r for r in caplog.records if f"room.{kind}: no texture for 1 of 1" in r.getMessage()]) == 1
+    assert (looking_north(scene)[20:80, 20:140] == GREY[0]).all()
+
+
 def test_the_start_tag_hangs_on_the_rough_wall_of_a_scan(tmp_path: Path, rng: np.random.Generator) -> None:
     scan = trimesh.util.concatenate(coloured(shell(), (120, 140, 90)))
     scan = scan.subdivide_to_size(0.15)
@@ -243,8 +293,141 @@ def test_a_mesh_far_from_zero_is_moved_there(tmp_path: Path) -> None:
 
 def test_a_floor_narrower_than_the_robot_is_refused(tmp_path: Path) -> None:
     path = saved(tmp_path / "gap.glb", painted(shell(6.0, 0.6)))
-    with pytest.raises(SynthesisError, match=r"gap.glb: no free floor for a robot .*expected 1 m2 .*0.36 m"):
+    with pytest.raises(
+        SynthesisError, match=r"gap.glb: no free floor above the robot's width .*expected 1 m2 .*0.36 m"
+    ):
         import_scene(path, MeshOptions(up="z"))
+
+
+def poles() -> list[trimesh.Trimesh]:
+    places = [(x, y) for x in np.arange(0.2, 4.0, 0.45) for y in np.arange(0.2, 3.0, 0.45)]
+    return [block((x, y, 0.0), (x + 0.05, y + 0.05, 2.0)) for x, y in places]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [hall(4.0, 3.0, 2.6), *poles()],
+        [hall(6.0, 5.0, 1.6)],
+        [hall(6.0, 5.0, 2.6), block((0.0, 0.0, 0.0), (6.0, 2.2, 2.6)), block((0.0, 2.8, 0.0), (6.0, 5.0, 2.6))],
+    ],
+    ids=["poles", "low", "narrow"],
+)
+def test_neither_a_roof_nor_the_hollow_of_a_solid_is_floor(tmp_path: Path, parts: list[trimesh.Trimesh]) -> None:
+    path = saved(tmp_path / "room.ply", parts)
+    with pytest.raises(SynthesisError, match=r"room.ply: no free floor above the robot's width") as error:
+        import_scene(path)
+    assert "\n" not in str(error.value)
+
+
+def test_the_ground_around_a_house_that_is_full_is_floor(tmp_path: Path) -> None:
+    house = [hall(4.0, 3.0, 2.6), *poles()]
+    ground = block((-4.0, -4.0, -0.2), (8.0, 7.0, 0.0))
+    scene = import_scene(saved(tmp_path / "house.ply", [*house, ground]))
+    assert scene.free_floor([(-2.0, 1.0)], 0.36).all()
+    assert not scene.free_floor([(2.0, 1.5)], 0.2).any()
+
+
+def test_a_room_whose_faces_all_look_out_is_a_room(tmp_path: Path) -> None:
+    scene = import_scene(saved(tmp_path / "room.ply", [block((0.0, 0.0, 0.0), (6.0, 5.0, 2.6))]))
+    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
+    assert scene.free_floor([(3.0, 2.5)], 1.5).all()
+
+
+def test_a_long_narrow_corridor_is_taken_with_z_up(tmp_path: Path) -> None:
+    scene = import_scene(saved(tmp_path / "corridor.ply", [hall(20.0, 2.0, 2.6)]))
+    assert np.allclose(scene.bounds[1], [20.0, 2.0, 2.6])
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+def test_text_in_an_older_encoding_is_read(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / f"room.{kind}"
+    if kind == "ply":
+        saved(path, coloured(shell(), (200, 120, 40)))
+        path.write_bytes(path.read_bytes().replace(b"comment", "comment Büro,".encode("latin-1"), 1))
+    else:
+        saved(path, painted(shell(), Image.new("RGB", (8, 8), (200, 120, 40))))
+        for text in (path, tmp_path / "material.mtl"):
+            content = text.read_text().replace("mtl paint", "mtl türkis")
+            text.write_bytes(f"# Büro\n{content}".encode("latin-1"))
+    with caplog.at_level(logging.WARNING):
+        seen = looking_north(import_scene(path))
+    assert np.abs(seen[20:80, 20:140].astype(int) - (200, 120, 40)).max() <= 3
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("number", [-7, 7])
+def test_a_face_with_a_vertex_that_does_not_exist_is_refused(tmp_path: Path, number: int) -> None:
+    path = tmp_path / "room.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        f"0 0 0\n9 0 0\n0 9 0\n3 0 1 {number}\n"
+    )
+    with pytest.raises(SynthesisError, match=rf"room.ply: a face has vertex {number} of 3; expected 0..2; repair"):
+        import_scene(path)
+
+
+@pytest.mark.parametrize("far", ["1e9", "inf"])
+def test_texture_coordinates_that_cannot_be_meant_are_refused(tmp_path: Path, far: str) -> None:
+    path = saved(tmp_path / "room.obj", painted(shell()))
+    lines = path.read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("vt"))
+    lines[first] = f"vt {far} {far}"
+    path.write_text("\n".join(lines))
+    expected = r"room.obj: \d of 10 faces repeat their texture up to (1e\+09|inf) times; expected 1000 at most; repair"
+    with pytest.raises(SynthesisError, match=expected):
+        import_scene(path)
+
+
+def test_extensions_that_are_no_list_do_not_matter(room: Path) -> None:
+    data = room.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    header = json.dumps({**json.loads(data[20 : 20 + length]), "extensionsRequired": None}).encode()
+    header += b" " * (-len(header) % 4)
+    rest = data[20 + length :]
+    sizes = [(n).to_bytes(4, "little") for n in (20 + len(header) + len(rest), len(header))]
+    room.write_bytes(data[:8] + sizes[0] + sizes[1] + data[16:20] + header + rest)
+    assert import_scene(room).free_floor([(1.5, 2.5)], 0.36).all()
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, kind: str) -> None:
+    # Reading it fails whoever asks, even one who may read everything.
+    (tmp_path / f"room.{kind}").symlink_to("/proc/self/mem")
+    with pytest.raises(SynthesisError, match=rf"room.{kind}: cannot be read .*; .*") as error:
+        import_scene(tmp_path / f"room.{kind}")
+    assert "\n" not in str(error.value)
+
+
+def test_two_meshes_of_one_name_are_both_named(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        saved(tmp_path / folder / "room.ply", [hall(4.0, 3.0, 2.6)])
+    scenes = [str(tmp_path / folder / "room.ply") for folder in ("a", "b")]
+    (tmp_path / "set").write_text("a file")
+    with pytest.raises(SynthesisError, match=r"a/room.ply, .*b/room.ply: both are named 'room'.*rename one"):
+        make_scenes(scenes, tmp_path / "set", options=DatasetOptions())
+
+
+@pytest.mark.parametrize("command", [["synthesize", "--scene"], ["dataset", "--scenes"]])
+@pytest.mark.parametrize("flag", [["--unit", "mm"], ["--up", "y"]])
+def test_how_to_read_a_mesh_is_refused_without_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], flag: list[str]
+) -> None:
+    # Where nothing can be written nothing would be made, either.
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(SystemExit, match="1"):
+        cli.main([*command, "office", "--out", str(tmp_path / "out"), *flag])
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert f"{' '.join(flag)}: no scene is a mesh (office)" in said[0]
+
+
+def test_a_mesh_without_walls_is_told_what_helps(tmp_path: Path, rng: np.random.Generator) -> None:
+    scene = import_scene(saved(tmp_path / "lawn.ply", [block((0.0, 0.0, 0.0), (6.0, 6.0, 0.02))]))
+    with pytest.raises(SynthesisError, match=r"no bare wall .*; use another seed, or in a mesh of your own"):
+        staging.set_stage(scene, staging.StageOptions(waypoints=0, start_places=1), rng=rng)
 
 
 @pytest.mark.parametrize(
