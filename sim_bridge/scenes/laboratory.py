@@ -207,7 +207,8 @@ def _corridor(build: Builder, rng: np.random.Generator, look: Ware) -> None:
     furniture.clutter(build, rng, look, moved(low, 0.0, 0.22, 1.0), width_m=0.8, count=2)
     _print(build, rng, low, (0.6, 0.75), image=textures.page(rng, px((0.6, 0.75))), up_m=1.75)
     furniture.shower(build, look, HALL.on(SOUTH, 10.03))
-    for x, y, yaw in ((7.75, 0.9, np.pi / 2), (9.1, 7.0, 0.0)):
+    spots = ((7.75, 0.9, np.pi / 2), (9.1, 7.0, 0.0), (3.65, 3.9, 0.0), (1.4, 1.2, np.pi / 2), (5.9, 1.0, np.pi / 2))
+    for x, y, yaw in (*spots, (5.9, 6.6, 0.0), (10.3, 4.2, 0.0), (8.0, 4.9, np.pi / 2)):
         _hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw))
 
 

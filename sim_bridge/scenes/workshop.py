@@ -173,7 +173,7 @@ def _gate(build: Builder, rng: np.random.Generator, look: Gear) -> None:
         _print(build, rng, HALL.on(EAST, at), size, up_m=1.5)
     size = (0.75, 0.55)
     _print(build, rng, moved(place, y_m=0.04), size, image=prints.warning(rng, px(size)), up_m=1.35, name="sign")
-    for x, y, yaw in ((3.7, 3.65, np.pi / 2),):
+    for x, y, yaw in ((3.7, 3.65, np.pi / 2), (6.6, 2.4, 0.0), (8.6, 5.6, np.pi / 2)):
         _hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw))
 
 
