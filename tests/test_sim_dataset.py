@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from fieldkit.errors import FieldkitError
 from fieldkit.frames import log, pose_error
@@ -94,6 +95,13 @@ def test_too_many_places_are_refused(scene: Scene) -> None:
     options = dataclasses.replace(OPTIONS.lookouts, count=9000)
     with pytest.raises(SynthesisError, match=r"can stand; expected at least 9000; ask for fewer waypoints"):
         find_lookouts(scene, options, rng=np.random.default_rng(0))
+
+
+def test_a_region_without_room_for_the_arm_gives_its_place_to_another_one() -> None:
+    source = SceneSource("laboratory", dataclasses.replace(OPTIONS, lookouts=LookoutOptions(count=100, views=2)))
+    at = np.array([w.world_from_body.translation for w in source.waypoints()])
+    assert len(at) == 100
+    assert cKDTree(at).query(at, k=2)[0][:, 1].min() >= 0.2
 
 
 def test_priors_err_as_their_covariance_says_and_kinematics_are_not_quite_the_truth() -> None:
