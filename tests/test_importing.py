@@ -334,6 +334,14 @@ def test_a_room_whose_faces_all_look_out_is_a_room(tmp_path: Path) -> None:
     assert scene.free_floor([(3.0, 2.5)], 1.5).all()
 
 
+@pytest.mark.parametrize("thick_m", [0.06, 0.2, 0.28])
+def test_the_floor_is_the_top_of_a_slab_not_its_underside(tmp_path: Path, thick_m: float) -> None:
+    slab = block((0.0, 0.0, -thick_m), (LENGTH_M, WIDTH_M, 0.0))
+    scene = import_scene(saved(tmp_path / "slab.ply", [slab, *shell()[1:]]))
+    assert scene.bounds[0, 2] == pytest.approx(-thick_m, abs=1e-6)
+    assert scene.free_floor([(3.0, 2.5)], 0.36).all()
+
+
 def test_a_long_narrow_corridor_is_taken_with_z_up(tmp_path: Path) -> None:
     scene = import_scene(saved(tmp_path / "corridor.ply", [hall(20.0, 2.0, 2.6)]))
     assert np.allclose(scene.bounds[1], [20.0, 2.0, 2.6])

@@ -24,6 +24,8 @@ SAG_M = 0.08
 # A robot that drives is a disc of this radius.
 ROBOT_RADIUS_M = 0.36
 LEVEL_BIN_M = 0.02
+# Levels closer than 0.3 m are one.
+APART_BINS = 15
 MOST_LEVELS = 8
 SMALLEST_M2 = 1.0
 # What lies by more than this share above a room is its ceiling.
@@ -115,20 +117,37 @@ def _roof(plan: _Plan, plans: Sequence[_Plan], shelters: Sequence[Shelter]) -> M
 
 
 def _levels(heights: Array, areas: Array) -> list[float]:
-    """Return heights at which horizontal faces have the most area, at least 0.3 m apart."""
+    """Return heights at which horizontal faces have the most area, APART_BINS bins apart."""
     if not len(heights):
         return []
     low = float(heights.min()) - 0.5
     bins = ((heights - low) / LEVEL_BIN_M).astype(int)
-    area = gaussian_filter1d(np.bincount(bins, weights=areas, minlength=int(bins.max()) + 25), 1.5)
+    area: Array = gaussian_filter1d(np.bincount(bins, weights=areas, minlength=int(bins.max()) + 25), 1.5)
     found: list[float] = []
     least = 0.1 * area.max()
     while len(found) < MOST_LEVELS and area.max() > least:
-        peak = int(np.argmax(area))
+        peak = _upper(area, int(np.argmax(area)))
         near = np.abs(heights - (low + (peak + 0.5) * LEVEL_BIN_M)) < 3 * LEVEL_BIN_M
-        found.append(_median(heights[near], areas[near]))
-        area[max(0, peak - 15) : peak + 16] = 0.0
+        found.append(_surface(heights[near], areas[near]))
+        area[max(0, peak - APART_BINS) : peak + APART_BINS + 1] = 0.0
     return found
+
+
+def _upper(area: Array, peak: int) -> int:
+    """Return the bin of the highest level near a peak with half of its area: the top of a slab, not its underside."""
+    for k in range(min(peak + APART_BINS, len(area) - 2), peak, -1):
+        if area[k] >= max(0.5 * area[peak], area[k - 1]) and area[k] > area[k + 1]:
+            return k
+    return peak
+
+
+def _surface(heights: Array, areas: Array) -> float:
+    """Return the height of a level: the median of its faces, or of the upper ones where they are those of a slab."""
+    middle = _median(heights, areas)
+    upper = heights > middle + 0.75 * LEVEL_BIN_M
+    if areas[upper].sum() >= 0.5 * areas[~upper].sum():
+        return _median(heights[upper], areas[upper])
+    return middle
 
 
 def _median(values: Array, weights: Array) -> float:
