@@ -122,7 +122,8 @@ def _levels(heights: Array, areas: Array) -> list[float]:
         return []
     low = float(heights.min()) - 0.5
     bins = ((heights - low) / LEVEL_BIN_M).astype(int)
-    area: Array = gaussian_filter1d(np.bincount(bins, weights=areas, minlength=int(bins.max()) + 25), 1.5)
+    total = np.bincount(bins, weights=areas, minlength=int(bins.max()) + 25).astype(np.float64)
+    area: Array = gaussian_filter1d(total, 1.5)
     found: list[float] = []
     least = 0.1 * area.max()
     while len(found) < MOST_LEVELS and area.max() > least:
