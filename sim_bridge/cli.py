@@ -81,6 +81,9 @@ def synthesize(
     for name, value, low, high in limits:
         if not low <= value <= high:
             raise SynthesisError(f"--{name} {value}: expected {low}..{high}", hint="choose another number")
+    for effect, given in (("jpeg", quality is not None and "--quality"), ("lens", lens is not None and "--lens")):
+        if given and effect in without:
+            raise SynthesisError(f"{given} sets what --without {effect} switches off", hint="leave one of them out")
     chosen = load_sensors(sensors) if lens is None else with_lens(load_sensors(sensors), lens)
     chosen = switched_off(chosen if quality is None else with_quality(chosen, quality), without)
     refuse_lenses(chosen, where=sensors)
