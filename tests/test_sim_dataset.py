@@ -14,7 +14,11 @@ from scipy.spatial import cKDTree
 
 from fieldkit.errors import FieldkitError
 from fieldkit.frames import log, pose_error
+from fieldkit.judge import nearest_distance
+from fieldkit.maps import MapOptions, build_map, load_map
+from fieldkit.maps.gauge import fit_gauge
 from fieldkit.maps.source import read_source
+from fieldkit.types import Surface
 from sim_bridge.cli import main
 from sim_bridge.dataset import DatasetOptions, MeshSource, SceneOptions, SceneSource, make_scenes
 from sim_bridge.errors import SynthesisError
@@ -152,6 +156,20 @@ def test_the_mapping_is_a_source_of_map_build(tmp_path: Path) -> None:
     walk = read_source(tmp_path)
     assert sorted(true) == sorted(image.name for image in walk.images)
     assert len(walk.depth) == 2
+
+
+def test_a_map_of_rendered_images_lies_on_the_true_surface(tmp_path: Path) -> None:
+    some = SceneSource("room", dataclasses.replace(CALM, walk=WalkOptions(stations=16, laps=0.35)))
+    true = some.write_mapping(tmp_path / "mapping")
+    build_map(tmp_path / "mapping", tmp_path / "room.map", options=MapOptions(max_keypoints=800))
+    room_map = load_map(tmp_path / "room.map")
+    gauge = fit_gauge(room_map, true)
+    assert gauge.rms_m < 0.01
+    scene = some._mapped()
+    landmarks = gauge.world_from_map.apply(room_map.xyz)
+    distance = nearest_distance(Surface(scene.vertices, scene.faces, 0.0), landmarks, rng=np.random.default_rng(0))
+    assert len(distance) > 1000
+    assert np.median(distance) < 0.01
 
 
 def test_a_mesh_is_a_source_whose_keys_follow_its_content(tmp_path: Path) -> None:
