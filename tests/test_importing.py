@@ -1,4 +1,4 @@
-"""Meshes of one's own: what is read, what becomes of colours and textures, the floor, and every refusal in one line."""
+"""Meshes of one's own: what is read, what becomes of colours and textures, and every refusal in one line."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from mesh_files import HEIGHT_M, LENGTH_M, WIDTH_M, coloured, hall, painted, saved, shell, table
 from PIL import Image
 
 from fieldkit.cameras import Camera
@@ -21,81 +22,8 @@ from sim_bridge.importing import MeshOptions, import_scene
 from sim_bridge.importing.colours import GREY
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.stage import staging, tours
 
 CAMERA = Camera("PINHOLE", 160, 120, (120.0, 120.0, 80.0, 60.0))
-LENGTH_M, WIDTH_M, HEIGHT_M = 6.0, 5.0, 2.8
-
-
-def quad(corners: list[tuple[float, float, float]]) -> trimesh.Trimesh:
-    """A rectangle with texture coordinates 0..1, its first corner at the texture's lower left."""
-    mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
-    mesh.visual = trimesh.visual.TextureVisuals(uv=np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=np.float64))
-    return mesh
-
-
-def shell(length: float = LENGTH_M, width: float = WIDTH_M) -> list[trimesh.Trimesh]:
-    """Floor and four walls of a room without a ceiling, seen from inside."""
-    ring = [(0.0, 0.0), (length, 0.0), (length, width), (0.0, width)]
-    walls = [
-        quad([(*a, 0.0), (*b, 0.0), (*b, HEIGHT_M), (*a, HEIGHT_M)])
-        for a, b in zip(ring, ring[1:] + ring[:1], strict=True)
-    ]
-    return [quad([(x, y, 0.0) for x, y in ring]), *walls]
-
-
-def table() -> trimesh.Trimesh:
-    """A plate on 0.7 m at (4.5, 2.5)."""
-    top = trimesh.creation.box((1.0, 1.0, 0.05), trimesh.transformations.translation_matrix((4.5, 2.5, 0.7)))
-    top.visual.face_colors = (90, 60, 30, 255)
-    return top
-
-
-def checks(px: int = 64) -> Image.Image:
-    """Red upper left, green upper right, blue lower left, white lower right."""
-    image = np.zeros((px, px, 3), np.uint8)
-    half = px // 2
-    image[:half, :half] = (250, 0, 0)
-    image[:half, half:] = (0, 250, 0)
-    image[half:, :half] = (0, 0, 250)
-    image[half:, half:] = (250, 250, 250)
-    return Image.fromarray(image)
-
-
-def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
-    """A closed box seen from outside."""
-    return trimesh.creation.box(bounds=[low, high])
-
-
-def hall(length: float, width: float, height: float) -> trimesh.Trimesh:
-    """A closed box seen from inside."""
-    room = block((0.0, 0.0, 0.0), (length, width, height))
-    room.invert()
-    return room
-
-
-def painted(parts: list[trimesh.Trimesh], image: Image.Image | None = None) -> list[trimesh.Trimesh]:
-    for part in parts:
-        material = trimesh.visual.material.SimpleMaterial(
-            image=image or checks(), name="paint", diffuse=(255, 255, 255)
-        )
-        part.visual = trimesh.visual.TextureVisuals(uv=part.visual.uv, material=material)
-    return parts
-
-
-def coloured(parts: list[trimesh.Trimesh], rgb: tuple[int, int, int]) -> list[trimesh.Trimesh]:
-    for part in parts:
-        part.visual = trimesh.visual.ColorVisuals(part, vertex_colors=np.tile((*rgb, 255), (len(part.vertices), 1)))
-    return parts
-
-
-def saved(path: Path, parts: list[trimesh.Trimesh]) -> Path:
-    scene = trimesh.Scene(parts)
-    if path.suffix == ".ply":
-        trimesh.util.concatenate(parts).export(path)
-    else:
-        scene.export(path)
-    return path
 
 
 def looking_north(scene: Scene, *, yaw_deg: float = 90.0) -> np.ndarray:
@@ -155,33 +83,6 @@ def test_textures_repeat_outside_of_their_image(tmp_path: Path) -> None:
     assert 0.15 < red.mean() < 0.35
     stripes = cv2.connectedComponents(red.astype(np.uint8))[0] - 1
     assert stripes > 15
-
-
-def test_free_floor_is_where_nothing_stands(room: Path) -> None:
-    scene = import_scene(room)
-    spots = [(1.5, 2.5), (4.5, 2.5), (0.2, 2.5), (3.5, 0.5), (8.0, 2.5), (3.7, 2.5)]
-    assert scene.free_floor(spots, 0.36).tolist() == [True, False, False, True, False, False]
-    assert scene.free_floor([(1.5, 2.5)], 1.3).all()
-    assert not scene.free_floor([(1.5, 2.5)], 1.7).any()
-
-
-def test_a_tour_of_a_mesh_stays_on_its_floor(room: Path) -> None:
-    scene = import_scene(room)
-    loop = tours.tour(scene)
-    assert scene.free_floor(loop, 0.3).all()
-    assert loop[:, 0].max() - loop[:, 0].min() > 2.0
-
-
-def test_the_largest_floor_lies_at_zero(tmp_path: Path) -> None:
-    lower = painted(shell())
-    upper = painted(shell(3.0, 2.0))
-    for part in lower:
-        part.apply_translation((0.0, 0.0, -3.2))
-    for part in upper:
-        part.apply_translation((0.0, 0.0, 0.1))
-    scene = import_scene(saved(tmp_path / "two.glb", lower + upper))
-    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
-    assert scene.free_floor([(5.0, 4.0)], 0.36).all()
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0)])
@@ -260,91 +161,6 @@ def test_what_names_a_file_that_is_not_there_is_grey_and_said(
         scene = import_scene(path)
     assert len([r for r in caplog.records if f"room.{kind}: no texture for 1 of 1" in r.getMessage()]) == 1
     assert (looking_north(scene)[20:80, 20:140] == GREY[0]).all()
-
-
-def test_the_start_tag_hangs_on_the_rough_wall_of_a_scan(tmp_path: Path, rng: np.random.Generator) -> None:
-    scan = trimesh.util.concatenate(coloured(shell(), (120, 140, 90)))
-    scan = scan.subdivide_to_size(0.15)
-    scan.vertices += rng.normal(0.0, 0.0015, scan.vertices.shape)
-    scan.visual = trimesh.visual.ColorVisuals(scan, vertex_colors=rng.integers(0, 255, (len(scan.vertices), 3)))
-    scan.export(tmp_path / "scan.ply")
-    scene = import_scene(tmp_path / "scan.ply")
-    stage = staging.set_stage(scene, staging.StageOptions(waypoints=0, start_places=1), rng=rng)
-    x, y, _ = stage.start_tag.world_from_tag.translation
-    assert 0.005 < min(x, y, LENGTH_M - x, WIDTH_M - y) < 0.025
-    normal = stage.start_tag.world_from_tag.rotation.apply([0.0, 0.0, 1.0])
-    assert max(np.abs(normal)) > np.cos(np.radians(2.0))
-    in_front = stage.start_tag.world_from_tag.apply([0.0, 0.0, 0.005])
-    half = 0.06
-    corners = [[u, v, 0.003] for u in (-half, half) for v in (-half, half)]
-    rays = stage.start_tag.world_from_tag.apply(corners) - in_front
-    assert (scene.intersect(in_front, rays) > np.linalg.norm(rays, axis=1)).all()
-
-
-def test_a_mesh_far_from_zero_is_moved_there(tmp_path: Path) -> None:
-    parts = painted(shell())
-    for part in parts:
-        part.apply_translation((250_000.0, -4_000_000.0, 312.0))
-    scene = import_scene(saved(tmp_path / "grid.obj", parts))
-    assert np.abs(scene.bounds).max() < 10.0
-    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-3)
-    assert 15.0 < 25.0 * scene.free_floor(np.random.default_rng(0).uniform(-2.5, 2.5, (500, 2)), 0.2).mean() <= 25.0
-
-
-def test_a_floor_narrower_than_the_robot_is_refused(tmp_path: Path) -> None:
-    path = saved(tmp_path / "gap.glb", painted(shell(6.0, 0.6)))
-    with pytest.raises(
-        SynthesisError, match=r"gap.glb: no free floor above the robot's width .*expected 1 m2 .*0.36 m"
-    ):
-        import_scene(path, MeshOptions(up="z"))
-
-
-def poles() -> list[trimesh.Trimesh]:
-    places = [(x, y) for x in np.arange(0.2, 4.0, 0.45) for y in np.arange(0.2, 3.0, 0.45)]
-    return [block((x, y, 0.0), (x + 0.05, y + 0.05, 2.0)) for x, y in places]
-
-
-@pytest.mark.parametrize(
-    "parts",
-    [
-        [hall(4.0, 3.0, 2.6), *poles()],
-        [hall(6.0, 5.0, 1.6)],
-        [hall(6.0, 5.0, 2.6), block((0.0, 0.0, 0.0), (6.0, 2.2, 2.6)), block((0.0, 2.8, 0.0), (6.0, 5.0, 2.6))],
-    ],
-    ids=["poles", "low", "narrow"],
-)
-def test_neither_a_roof_nor_the_hollow_of_a_solid_is_floor(tmp_path: Path, parts: list[trimesh.Trimesh]) -> None:
-    path = saved(tmp_path / "room.ply", parts)
-    with pytest.raises(SynthesisError, match=r"room.ply: no free floor above the robot's width") as error:
-        import_scene(path)
-    assert "\n" not in str(error.value)
-
-
-def test_the_ground_around_a_house_that_is_full_is_floor(tmp_path: Path) -> None:
-    house = [hall(4.0, 3.0, 2.6), *poles()]
-    ground = block((-4.0, -4.0, -0.2), (8.0, 7.0, 0.0))
-    scene = import_scene(saved(tmp_path / "house.ply", [*house, ground]))
-    assert scene.free_floor([(-2.0, 1.0)], 0.36).all()
-    assert not scene.free_floor([(2.0, 1.5)], 0.2).any()
-
-
-def test_a_room_whose_faces_all_look_out_is_a_room(tmp_path: Path) -> None:
-    scene = import_scene(saved(tmp_path / "room.ply", [block((0.0, 0.0, 0.0), (6.0, 5.0, 2.6))]))
-    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
-    assert scene.free_floor([(3.0, 2.5)], 1.5).all()
-
-
-@pytest.mark.parametrize("thick_m", [0.06, 0.2, 0.28])
-def test_the_floor_is_the_top_of_a_slab_not_its_underside(tmp_path: Path, thick_m: float) -> None:
-    slab = block((0.0, 0.0, -thick_m), (LENGTH_M, WIDTH_M, 0.0))
-    scene = import_scene(saved(tmp_path / "slab.ply", [slab, *shell()[1:]]))
-    assert scene.bounds[0, 2] == pytest.approx(-thick_m, abs=1e-6)
-    assert scene.free_floor([(3.0, 2.5)], 0.36).all()
-
-
-def test_a_long_narrow_corridor_is_taken_with_z_up(tmp_path: Path) -> None:
-    scene = import_scene(saved(tmp_path / "corridor.ply", [hall(20.0, 2.0, 2.6)]))
-    assert np.allclose(scene.bounds[1], [20.0, 2.0, 2.6])
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply"])
@@ -432,12 +248,6 @@ def test_how_to_read_a_mesh_is_refused_without_one(
     assert f"{' '.join(flag)}: no scene is a mesh (office)" in said[0]
 
 
-def test_a_mesh_without_walls_is_told_what_helps(tmp_path: Path, rng: np.random.Generator) -> None:
-    scene = import_scene(saved(tmp_path / "lawn.ply", [block((0.0, 0.0, 0.0), (6.0, 6.0, 0.02))]))
-    with pytest.raises(SynthesisError, match=r"no bare wall .*; use another seed, or in a mesh of your own"):
-        staging.set_stage(scene, staging.StageOptions(waypoints=0, start_places=1), rng=rng)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -461,16 +271,3 @@ def test_files_that_are_no_meshes_end_in_one_line_and_leave_nothing(
     with pytest.raises(SynthesisError, match=message):
         import_scene(path)
     assert not out.exists()
-
-
-def test_a_foreign_house_is_read_with_its_floor(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        scene = import_scene(shared_data / "small_house" / "small_house.glb")
-    assert "no texture for 3 of 108 parts" in caplog.text
-    assert np.allclose(np.ptp(scene.bounds, axis=0), [19.0, 11.4, 3.0], atol=0.01)
-    graph, _ = tours.walkable(scene)
-    assert 70.0 < 0.01 * len(graph.centres) < 150.0
-    assert 150.0 < tours.shown_area_m2(scene, graph) < 217.0
-    free = graph.centres[:: len(graph.centres) // 200]
-    below = scene.intersect(np.column_stack([free, np.full(len(free), 1.7)]), [0.0, 0.0, -1.0])
-    assert np.abs(below - 1.7).max() < 0.06
