@@ -17,6 +17,7 @@ from fieldkit.errors import FieldkitError
 
 if TYPE_CHECKING:
     from fieldkit.dataset import Progress
+    from sim_bridge.importing import MeshOptions
 
 # The simulator itself is imported inside the command: --help must not wait for a compiler.
 
@@ -64,7 +65,6 @@ def synthesize(
         force: replace an existing folder
     """
     from sim_bridge.errors import SynthesisError
-    from sim_bridge.importing import MeshOptions
     from sim_bridge.mapping.lenses import refuse_lenses
     from sim_bridge.recording.recorder import own_format
     from sim_bridge.scenes.changes import find_changes
@@ -81,6 +81,9 @@ def synthesize(
     for name, value, low, high in limits:
         if not low <= value <= high:
             raise SynthesisError(f"--{name} {value}: expected {low}..{high}", hint="choose another number")
+    for effect, given in (("jpeg", quality is not None and "--quality"), ("lens", lens is not None and "--lens")):
+        if given and effect in without:
+            raise SynthesisError(f"{given} sets what --without {effect} switches off", hint="leave one of them out")
     chosen = load_sensors(sensors) if lens is None else with_lens(load_sensors(sensors), lens)
     chosen = switched_off(chosen if quality is None else with_quality(chosen, quality), without)
     refuse_lenses(chosen, where=sensors)
@@ -93,7 +96,7 @@ def synthesize(
         recorder=dataclasses.replace(standard.recorder, layout=layout),
         sensors=chosen,
         changes=find_changes(changes),
-        mesh=MeshOptions(up=up, unit=unit),
+        mesh=_mesh_options((scene,), unit=unit, up=up),
     )
     begin = time.monotonic()
     write_session(scene, out, seed=seed, formats=format or (own_format(layout),), options=options, force=force)
@@ -121,7 +124,7 @@ def dataset(
     A killed run goes on with the same command. Replay it with `fieldkit replay OUT --protocol paper_sim --out RUN`.
 
     Args:
-        scenes: names of scenes, or meshes of buildings: .glb, .obj or .ply files
+        scenes: names of scenes, or meshes of buildings: .glb, .obj or .ply files; they join those that OUT holds
         out: dataset folder to write, or to go on with
         seed: the same seed gives the same bytes
         waypoints: places per scene
@@ -133,15 +136,15 @@ def dataset(
         repeat_share: share of the views that are localized again
         unit: unit of the meshes; by default they have to look like metres
         up: axis of the meshes that points up; by default it has to look like z
-        force: make the views again where settings differ; maps that still fit are kept
+        force: make the views of these scenes again where they were made otherwise; maps that still fit are kept, and
+            scenes of OUT that are not named stay: settings other than theirs are refused
     """
     from sim_bridge.dataset import DatasetOptions, make_scenes
-    from sim_bridge.importing import MeshOptions
     from sim_bridge.mapping.lenses import refuse_lenses
     from sim_bridge.sensors import load_sensors
 
     refuse_lenses(load_sensors(sensors), where=sensors)
-    mesh = MeshOptions(up=up, unit=unit)
+    mesh = _mesh_options(scenes, unit=unit, up=up)
     options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh)
     made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())
     for row in made:
@@ -150,6 +153,22 @@ def dataset(
             f"{row.scene}: {row.waypoints} of {row.planned} waypoints, {row.views} views, "
             f"{100 * row.localized:.1f} % localize{again}"
         )
+
+
+def _mesh_options(
+    scenes: tuple[str, ...], *, unit: Literal["m", "cm", "mm"] | None, up: Literal["z", "y"] | None
+) -> MeshOptions:
+    """Return how meshes are to be read; raises SynthesisError where that is said and there is none."""
+    from sim_bridge.errors import SynthesisError
+    from sim_bridge.importing import MeshOptions, is_mesh
+
+    for flag, value in (("unit", unit), ("up", up)):
+        if value is not None and not any(is_mesh(scene) for scene in scenes):
+            raise SynthesisError(
+                f"--{flag} {value}: no scene is a mesh ({', '.join(scenes)}); expected a .glb, .obj or .ply file",
+                hint=f"leave --{flag} out, or give a mesh's path",
+            )
+    return MeshOptions(up=up, unit=unit)
 
 
 class _ProgressLines:

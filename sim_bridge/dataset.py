@@ -254,6 +254,7 @@ def make_scenes(
             raise SynthesisError(f"unknown scene {name!r}", hint=suggestion(name, list(SCENES)))
         if is_mesh(name) and not Path(name).is_file():
             raise SynthesisError(f"{name}: no such file; expected a mesh", hint="check the path")
+    _check_names(scenes)
     chosen = SceneOptions(
         seed=options.seed,
         lookouts=LookoutOptions(count=options.waypoints, views=options.views),
@@ -271,6 +272,19 @@ def make_scenes(
         progress=progress,
     )
     return count_scenes(out)
+
+
+def _check_names(scenes: Sequence[str]) -> None:
+    """Raise SynthesisError where two scenes, one of them a mesh, would have the same name in the dataset."""
+    known: dict[str, str] = {}
+    for scene in scenes:
+        name = Path(scene).stem if is_mesh(scene) else scene
+        other = known.setdefault(name, scene)
+        if other != scene:
+            raise SynthesisError(
+                f"{other}, {scene}: both are named {name!r}; expected scenes of different names",
+                hint="rename one of the meshes",
+            )
 
 
 def _source(name: str, options: SceneOptions, mesh: MeshOptions) -> SceneSource:

@@ -115,6 +115,12 @@ class Scene:
         """
         return self._first_hits(*_rays(origins, directions))[0]
 
+    def intersect_sides(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the distances of `intersect` and whether surfaces are met from behind, their corners clockwise."""
+        start, unit = _rays(origins, directions)
+        distance, normal = self._first_hits(start, unit)
+        return distance, (normal * unit).sum(axis=1) > 0.0
+
     def trace(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
         """Return the distances of `intersect` and the surfaces' unit normals f64[n,3] that face the rays' origins.
 

@@ -24,3 +24,13 @@ def shared_data() -> Path:
             pytest.fail(f"{SHARED_DATA} is absent; CI runs with the real data beside the checkout")
         pytest.skip("the folder of real data (../shared/data) is absent")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of the tiny source, made by one worker without a break; nothing may be changed in it."""
+    from tiny_source import make
+
+    out = tmp_path_factory.mktemp("whole") / "set"
+    make(out)
+    return out

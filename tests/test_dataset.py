@@ -16,11 +16,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tiny_source import TinySource
+from tiny_source import RULES, SOURCE, content, make
 
 from fieldkit import maps, protocol, scores, store
 from fieldkit.cli import main
-from fieldkit.dataset import DatasetRules, count_scenes, make_dataset, replay_datasets
+from fieldkit.dataset import count_scenes, make_dataset, replay_datasets
 from fieldkit.errors import DatasetError, FieldkitError, StoreError
 from fieldkit.frames import pose_error
 from fieldkit.report import write_report
@@ -29,25 +29,7 @@ from fieldkit.surface import RayCaster
 from fieldkit.types import Candidates
 from fieldkit.views import visibility
 
-RULES = DatasetRules(repeats=2, repeat_share=0.4)
-SOURCE = TinySource()
 PAPER = protocol.load("paper_sim")
-
-
-def make(out: Path, *sources: TinySource, workers: int = 1, force: bool = False, rules: DatasetRules = RULES) -> None:
-    make_dataset(sources or [SOURCE], out, described={"seed": 0}, rules=rules, workers=workers, force=force)
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset made by one worker without a break."""
-    out = tmp_path_factory.mktemp("whole") / "set"
-    make(out)
-    return out
 
 
 @pytest.fixture
@@ -71,7 +53,7 @@ def test_two_workers_give_the_same_bytes_as_one_and_a_map_made_twice_is_the_same
 
 def test_a_killed_run_goes_on_to_the_same_bytes_and_leaves_no_process(whole: Path, mapped: Path) -> None:
     program = (
-        "from test_dataset import *\n"
+        "import dataclasses\nfrom pathlib import Path\nfrom tiny_source import *\n"
         f"if __name__ == '__main__': make(Path({str(mapped)!r}), dataclasses.replace(SOURCE, pause_s=0.3), workers=2)"
     )
     here = Path(__file__).resolve().parent
@@ -257,7 +239,7 @@ def test_an_unfinished_or_otherwise_localized_dataset_is_not_replayed(whole: Pat
     ("words", "message"),
     [
         (["--map", "lab.map"], "is a dataset; --map or --tags is given, too"),
-        (["other.bag"], "is a dataset; other.bag is none"),
+        ([__file__], "test_dataset.py is none"),
     ],
 )
 def test_datasets_are_replayed_alone(

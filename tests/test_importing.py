@@ -1,7 +1,8 @@
-"""Meshes of one's own: what is read, what becomes of colours and textures, the floor, and every refusal in one line."""
+"""Meshes of one's own: what is read, what becomes of colours and textures, and every refusal in one line."""
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
 
@@ -9,78 +10,20 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from mesh_files import HEIGHT_M, LENGTH_M, WIDTH_M, coloured, hall, painted, saved, shell, table
 from PIL import Image
 
 from fieldkit.cameras import Camera
 from sim_bridge import cli
 from sim_bridge.aim import aim
+from sim_bridge.dataset import DatasetOptions, make_scenes
 from sim_bridge.errors import SynthesisError
 from sim_bridge.importing import MeshOptions, import_scene
+from sim_bridge.importing.colours import GREY
 from sim_bridge.mesh import Scene
 from sim_bridge.rendering import render
-from sim_bridge.stage import staging, tours
 
 CAMERA = Camera("PINHOLE", 160, 120, (120.0, 120.0, 80.0, 60.0))
-LENGTH_M, WIDTH_M, HEIGHT_M = 6.0, 5.0, 2.8
-
-
-def quad(corners: list[tuple[float, float, float]]) -> trimesh.Trimesh:
-    """A rectangle with texture coordinates 0..1, its first corner at the texture's lower left."""
-    mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
-    mesh.visual = trimesh.visual.TextureVisuals(uv=np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=np.float64))
-    return mesh
-
-
-def shell(length: float = LENGTH_M, width: float = WIDTH_M) -> list[trimesh.Trimesh]:
-    """Floor and four walls of a room without a ceiling, seen from inside."""
-    ring = [(0.0, 0.0), (length, 0.0), (length, width), (0.0, width)]
-    walls = [
-        quad([(*a, 0.0), (*b, 0.0), (*b, HEIGHT_M), (*a, HEIGHT_M)])
-        for a, b in zip(ring, ring[1:] + ring[:1], strict=True)
-    ]
-    return [quad([(x, y, 0.0) for x, y in ring]), *walls]
-
-
-def table() -> trimesh.Trimesh:
-    """A plate on 0.7 m at (4.5, 2.5)."""
-    top = trimesh.creation.box((1.0, 1.0, 0.05), trimesh.transformations.translation_matrix((4.5, 2.5, 0.7)))
-    top.visual.face_colors = (90, 60, 30, 255)
-    return top
-
-
-def checks(px: int = 64) -> Image.Image:
-    """Red upper left, green upper right, blue lower left, white lower right."""
-    image = np.zeros((px, px, 3), np.uint8)
-    half = px // 2
-    image[:half, :half] = (250, 0, 0)
-    image[:half, half:] = (0, 250, 0)
-    image[half:, :half] = (0, 0, 250)
-    image[half:, half:] = (250, 250, 250)
-    return Image.fromarray(image)
-
-
-def painted(parts: list[trimesh.Trimesh], image: Image.Image | None = None) -> list[trimesh.Trimesh]:
-    for part in parts:
-        material = trimesh.visual.material.SimpleMaterial(
-            image=image or checks(), name="paint", diffuse=(255, 255, 255)
-        )
-        part.visual = trimesh.visual.TextureVisuals(uv=part.visual.uv, material=material)
-    return parts
-
-
-def coloured(parts: list[trimesh.Trimesh], rgb: tuple[int, int, int]) -> list[trimesh.Trimesh]:
-    for part in parts:
-        part.visual = trimesh.visual.ColorVisuals(part, vertex_colors=np.tile((*rgb, 255), (len(part.vertices), 1)))
-    return parts
-
-
-def saved(path: Path, parts: list[trimesh.Trimesh]) -> Path:
-    scene = trimesh.Scene(parts)
-    if path.suffix == ".ply":
-        trimesh.util.concatenate(parts).export(path)
-    else:
-        scene.export(path)
-    return path
 
 
 def looking_north(scene: Scene, *, yaw_deg: float = 90.0) -> np.ndarray:
@@ -104,7 +47,18 @@ def test_textures_lie_as_they_were_drawn(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
 def test_vertex_colours_are_seen(tmp_path: Path, kind: str) -> None:
-    seen = looking_north(import_scene(saved(tmp_path / f"room.{kind}", coloured(shell(), (200, 120, 40)))))
+    # glTF's colours are linear: these are 200, 120, 40 encoded.
+    stored = (147, 48, 5) if kind == "glb" else (200, 120, 40)
+    seen = looking_north(import_scene(saved(tmp_path / f"room.{kind}", coloured(shell(), stored))))
+    assert np.abs(seen[20:80, 20:140].astype(int) - (200, 120, 40)).max() <= 3
+
+
+def test_vertex_colours_beside_a_plain_material_are_seen(tmp_path: Path) -> None:
+    parts = shell()
+    for part in parts:
+        part.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(name="plain"))
+        part.visual.vertex_attributes["color"] = np.tile((147, 48, 5, 255), (4, 1)).astype(np.uint8)
+    seen = looking_north(import_scene(saved(tmp_path / "room.glb", parts)))
     assert np.abs(seen[20:80, 20:140].astype(int) - (200, 120, 40)).max() <= 3
 
 
@@ -129,33 +83,6 @@ def test_textures_repeat_outside_of_their_image(tmp_path: Path) -> None:
     assert 0.15 < red.mean() < 0.35
     stripes = cv2.connectedComponents(red.astype(np.uint8))[0] - 1
     assert stripes > 15
-
-
-def test_free_floor_is_where_nothing_stands(room: Path) -> None:
-    scene = import_scene(room)
-    spots = [(1.5, 2.5), (4.5, 2.5), (0.2, 2.5), (3.5, 0.5), (8.0, 2.5), (3.7, 2.5)]
-    assert scene.free_floor(spots, 0.36).tolist() == [True, False, False, True, False, False]
-    assert scene.free_floor([(1.5, 2.5)], 1.3).all()
-    assert not scene.free_floor([(1.5, 2.5)], 1.7).any()
-
-
-def test_a_tour_of_a_mesh_stays_on_its_floor(room: Path) -> None:
-    scene = import_scene(room)
-    loop = tours.tour(scene)
-    assert scene.free_floor(loop, 0.3).all()
-    assert loop[:, 0].max() - loop[:, 0].min() > 2.0
-
-
-def test_the_largest_floor_lies_at_zero(tmp_path: Path) -> None:
-    lower = painted(shell())
-    upper = painted(shell(3.0, 2.0))
-    for part in lower:
-        part.apply_translation((0.0, 0.0, -3.2))
-    for part in upper:
-        part.apply_translation((0.0, 0.0, 0.1))
-    scene = import_scene(saved(tmp_path / "two.glb", lower + upper))
-    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
-    assert scene.free_floor([(5.0, 4.0)], 0.36).all()
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0)])
@@ -212,39 +139,113 @@ def test_missing_textures_are_grey_and_said_once(tmp_path: Path, caplog: pytest.
     assert 100 < wall.mean() < 200
 
 
-def test_the_start_tag_hangs_on_the_rough_wall_of_a_scan(tmp_path: Path, rng: np.random.Generator) -> None:
-    scan = trimesh.util.concatenate(coloured(shell(), (120, 140, 90)))
-    scan = scan.subdivide_to_size(0.15)
-    scan.vertices += rng.normal(0.0, 0.0015, scan.vertices.shape)
-    scan.visual = trimesh.visual.ColorVisuals(scan, vertex_colors=rng.integers(0, 255, (len(scan.vertices), 3)))
-    scan.export(tmp_path / "scan.ply")
-    scene = import_scene(tmp_path / "scan.ply")
-    stage = staging.set_stage(scene, staging.StageOptions(waypoints=0, start_places=1), rng=rng)
-    x, y, _ = stage.start_tag.world_from_tag.translation
-    assert 0.005 < min(x, y, LENGTH_M - x, WIDTH_M - y) < 0.025
-    normal = stage.start_tag.world_from_tag.rotation.apply([0.0, 0.0, 1.0])
-    assert max(np.abs(normal)) > np.cos(np.radians(2.0))
-    in_front = stage.start_tag.world_from_tag.apply([0.0, 0.0, 0.005])
-    half = 0.06
-    corners = [[u, v, 0.003] for u in (-half, half) for v in (-half, half)]
-    rays = stage.start_tag.world_from_tag.apply(corners) - in_front
-    assert (scene.intersect(in_front, rays) > np.linalg.norm(rays, axis=1)).all()
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+def test_what_names_a_file_that_is_not_there_is_grey_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str
+) -> None:
+    path = tmp_path / f"room.{kind}"
+    room = trimesh.util.concatenate(shell())
+    if kind == "obj":
+        saved(path, painted([room]))
+        for material in tmp_path.glob("*.mtl"):
+            material.unlink()
+    else:
+        rows = [f"{x} {y} {z} {u} {v}" for (x, y, z), (u, v) in zip(room.vertices, room.visual.uv, strict=True)]
+        properties = "".join(f"property float {name}\n" for name in "xyzst")
+        path.write_text(
+            f"ply\nformat ascii 1.0\ncomment TextureFile gone.png\nelement vertex {len(rows)}\n{properties}"
+            f"element face {len(room.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+            + "\n".join(rows + [f"3 {a} {b} {c}" for a, b, c in room.faces])
+        )
+    with caplog.at_level(logging.WARNING):
+        scene = import_scene(path)
+    assert len([r for r in caplog.records if f"room.{kind}: no texture for 1 of 1" in r.getMessage()]) == 1
+    assert (looking_north(scene)[20:80, 20:140] == GREY[0]).all()
 
 
-def test_a_mesh_far_from_zero_is_moved_there(tmp_path: Path) -> None:
-    parts = painted(shell())
-    for part in parts:
-        part.apply_translation((250_000.0, -4_000_000.0, 312.0))
-    scene = import_scene(saved(tmp_path / "grid.obj", parts))
-    assert np.abs(scene.bounds).max() < 10.0
-    assert scene.bounds[0, 2] == pytest.approx(0.0, abs=1e-3)
-    assert 15.0 < 25.0 * scene.free_floor(np.random.default_rng(0).uniform(-2.5, 2.5, (500, 2)), 0.2).mean() <= 25.0
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+def test_text_in_an_older_encoding_is_read(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / f"room.{kind}"
+    if kind == "ply":
+        saved(path, coloured(shell(), (200, 120, 40)))
+        path.write_bytes(path.read_bytes().replace(b"comment", "comment Büro,".encode("latin-1"), 1))
+    else:
+        saved(path, painted(shell(), Image.new("RGB", (8, 8), (200, 120, 40))))
+        for text in (path, tmp_path / "material.mtl"):
+            content = text.read_text().replace("mtl paint", "mtl türkis")
+            text.write_bytes(f"# Büro\n{content}".encode("latin-1"))
+    with caplog.at_level(logging.WARNING):
+        seen = looking_north(import_scene(path))
+    assert np.abs(seen[20:80, 20:140].astype(int) - (200, 120, 40)).max() <= 3
+    assert not caplog.records
 
 
-def test_a_floor_narrower_than_the_robot_is_refused(tmp_path: Path) -> None:
-    path = saved(tmp_path / "gap.glb", painted(shell(6.0, 0.6)))
-    with pytest.raises(SynthesisError, match=r"gap.glb: no free floor for a robot .*expected 1 m2 .*0.36 m"):
-        import_scene(path, MeshOptions(up="z"))
+@pytest.mark.parametrize("number", [-7, 7])
+def test_a_face_with_a_vertex_that_does_not_exist_is_refused(tmp_path: Path, number: int) -> None:
+    path = tmp_path / "room.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        f"0 0 0\n9 0 0\n0 9 0\n3 0 1 {number}\n"
+    )
+    with pytest.raises(SynthesisError, match=rf"room.ply: a face has vertex {number} of 3; expected 0..2; repair"):
+        import_scene(path)
+
+
+@pytest.mark.parametrize("far", ["1e9", "inf"])
+def test_texture_coordinates_that_cannot_be_meant_are_refused(tmp_path: Path, far: str) -> None:
+    path = saved(tmp_path / "room.obj", painted(shell()))
+    lines = path.read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("vt"))
+    lines[first] = f"vt {far} {far}"
+    path.write_text("\n".join(lines))
+    expected = r"room.obj: \d of 10 faces repeat their texture up to (1e\+09|inf) times; expected 1000 at most; repair"
+    with pytest.raises(SynthesisError, match=expected):
+        import_scene(path)
+
+
+def test_extensions_that_are_no_list_do_not_matter(room: Path) -> None:
+    data = room.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    header = json.dumps({**json.loads(data[20 : 20 + length]), "extensionsRequired": None}).encode()
+    header += b" " * (-len(header) % 4)
+    rest = data[20 + length :]
+    sizes = [(n).to_bytes(4, "little") for n in (20 + len(header) + len(rest), len(header))]
+    room.write_bytes(data[:8] + sizes[0] + sizes[1] + data[16:20] + header + rest)
+    assert import_scene(room).free_floor([(1.5, 2.5)], 0.36).all()
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, kind: str) -> None:
+    # Reading it fails whoever asks, even one who may read everything.
+    (tmp_path / f"room.{kind}").symlink_to("/proc/self/mem")
+    with pytest.raises(SynthesisError, match=rf"room.{kind}: cannot be read .*; .*") as error:
+        import_scene(tmp_path / f"room.{kind}")
+    assert "\n" not in str(error.value)
+
+
+def test_two_meshes_of_one_name_are_both_named(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        saved(tmp_path / folder / "room.ply", [hall(4.0, 3.0, 2.6)])
+    scenes = [str(tmp_path / folder / "room.ply") for folder in ("a", "b")]
+    (tmp_path / "set").write_text("a file")
+    with pytest.raises(SynthesisError, match=r"a/room.ply, .*b/room.ply: both are named 'room'.*rename one"):
+        make_scenes(scenes, tmp_path / "set", options=DatasetOptions())
+
+
+@pytest.mark.parametrize("command", [["synthesize", "--scene"], ["dataset", "--scenes"]])
+@pytest.mark.parametrize("flag", [["--unit", "mm"], ["--up", "y"]])
+def test_how_to_read_a_mesh_is_refused_without_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], flag: list[str]
+) -> None:
+    # Where nothing can be written nothing would be made, either.
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(SystemExit, match="1"):
+        cli.main([*command, "office", "--out", str(tmp_path / "out"), *flag])
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert f"{' '.join(flag)}: no scene is a mesh (office)" in said[0]
 
 
 @pytest.mark.parametrize(
@@ -270,16 +271,3 @@ def test_files_that_are_no_meshes_end_in_one_line_and_leave_nothing(
     with pytest.raises(SynthesisError, match=message):
         import_scene(path)
     assert not out.exists()
-
-
-def test_a_foreign_house_is_read_with_its_floor(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        scene = import_scene(shared_data / "small_house" / "small_house.glb")
-    assert "no texture for 3 of 108 parts" in caplog.text
-    assert np.allclose(np.ptp(scene.bounds, axis=0), [19.0, 11.4, 3.0], atol=0.01)
-    graph, _ = tours.walkable(scene)
-    assert 70.0 < 0.01 * len(graph.centres) < 150.0
-    assert 150.0 < tours.shown_area_m2(scene, graph) < 217.0
-    free = graph.centres[:: len(graph.centres) // 200]
-    below = scene.intersect(np.column_stack([free, np.full(len(free), 1.7)]), [0.0, 0.0, -1.0])
-    assert np.abs(below - 1.7).max() < 0.06

@@ -8,6 +8,7 @@ import cv2
 import numba
 import numpy as np
 import pytest
+from empty_floor import empty_floor
 from numpy.typing import NDArray
 from pupil_apriltags import Detector
 from scipy.spatial.transform import Rotation
@@ -29,19 +30,7 @@ BACKGROUND = (255, 0, 255)
 
 
 def empty_scene() -> Scene:
-    return Scene(
-        vertices=np.zeros((0, 3)),
-        faces=np.zeros((0, 3), np.int32),
-        uv=np.zeros((0, 3, 2), np.float32),
-        texture=np.zeros(0, np.int32),
-        textures=(),
-        closed=np.zeros(0, np.bool_),
-        shade=np.zeros((0, 3), np.float32),
-        blocks=np.zeros((0, 8)),
-        walk_xy=np.zeros((0, 2)),
-        floor_bounds=(0.0, 0.0, 1.0, 1.0),
-        background=BACKGROUND,
-    )
+    return dataclasses.replace(empty_floor((1.0, 1.0), []), background=BACKGROUND)
 
 
 @pytest.fixture(scope="module")

@@ -390,3 +390,19 @@ def test_a_lens_that_cannot_be_drawn_is_refused_before_anything_is_made(
     assert ended.value.code == 1
     assert f"{path}: [hand.lens]: camera OPENCV 640x480: field of view too wide" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--quality", "80", "--without", "jpeg"], "--quality sets what --without jpeg switches off"),
+        (["--lens", "fisheye", "--without", "lens"], "--lens sets what --without lens switches off"),
+    ],
+)
+def test_what_is_switched_off_cannot_be_set(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["synthesize", "--out", str(tmp_path / "out"), *words])
+    assert ended.value.code == 1
+    assert message in capsys.readouterr().err

@@ -10,10 +10,15 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from fieldkit.errors import FieldkitError
 from fieldkit.frames import log, pose_error
+from fieldkit.judge import nearest_distance
+from fieldkit.maps import MapOptions, build_map, load_map
+from fieldkit.maps.gauge import fit_gauge
 from fieldkit.maps.source import read_source
+from fieldkit.types import Surface
 from sim_bridge.cli import main
 from sim_bridge.dataset import DatasetOptions, MeshSource, SceneOptions, SceneSource, make_scenes
 from sim_bridge.errors import SynthesisError
@@ -96,6 +101,13 @@ def test_too_many_places_are_refused(scene: Scene) -> None:
         find_lookouts(scene, options, rng=np.random.default_rng(0))
 
 
+def test_a_region_without_room_for_the_arm_gives_its_place_to_another_one() -> None:
+    source = SceneSource("laboratory", dataclasses.replace(OPTIONS, lookouts=LookoutOptions(count=100, views=2)))
+    at = np.array([w.world_from_body.translation for w in source.waypoints()])
+    assert len(at) == 100
+    assert cKDTree(at).query(at, k=2)[0][:, 1].min() > 0.05
+
+
 def test_priors_err_as_their_covariance_says_and_kinematics_are_not_quite_the_truth() -> None:
     many = SceneSource("room", dataclasses.replace(CALM, lookouts=LookoutOptions(count=40, views=1)))
     squares = []
@@ -146,6 +158,20 @@ def test_the_mapping_is_a_source_of_map_build(tmp_path: Path) -> None:
     assert len(walk.depth) == 2
 
 
+def test_a_map_of_rendered_images_lies_on_the_true_surface(tmp_path: Path) -> None:
+    some = SceneSource("room", dataclasses.replace(CALM, walk=WalkOptions(stations=16, laps=0.35)))
+    true = some.write_mapping(tmp_path / "mapping")
+    build_map(tmp_path / "mapping", tmp_path / "room.map", options=MapOptions(max_keypoints=800))
+    room_map = load_map(tmp_path / "room.map")
+    gauge = fit_gauge(room_map, true)
+    assert gauge.rms_m < 0.01
+    scene = some._mapped()
+    landmarks = gauge.world_from_map.apply(room_map.xyz)
+    distance = nearest_distance(Surface(scene.vertices, scene.faces, 0.0), landmarks, rng=np.random.default_rng(0))
+    assert len(distance) > 1000
+    assert np.median(distance) < 0.01
+
+
 def test_a_mesh_is_a_source_whose_keys_follow_its_content(tmp_path: Path) -> None:
     keys = []
     for shade in (90, 140, 90):
@@ -184,6 +210,18 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     with pytest.raises(FieldkitError, match=message):
         make_scenes(scenes, tmp_path / "set", options=options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_without_room_or_a_mesh_that_cannot_be_read_leaves_nothing(tmp_path: Path) -> None:
+    hall = trimesh.creation.box((6.0, 5.0, 2.8))
+    hall.vertices[0] = np.nan
+    hall.export(tmp_path / "nan.ply")
+    out = tmp_path / "set"
+    with pytest.raises(FieldkitError, match=r"nan: .*nan\.ply"):
+        make_scenes(["room", str(tmp_path / "nan.ply")], out, options=DatasetOptions(waypoints=2, views=2))
+    with pytest.raises(FieldkitError, match=r"room: .*ask for fewer waypoints"):
+        make_scenes(["room"], out, options=DatasetOptions(waypoints=9000))
+    assert not out.exists()
 
 
 def test_the_command_says_a_mistake_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

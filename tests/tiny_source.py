@@ -14,7 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
-from fieldkit.dataset import SourceView, SourceWaypoint
+from fieldkit.dataset import DatasetRules, SourceView, SourceWaypoint, make_dataset
+from fieldkit.errors import DatasetError
 from fieldkit.frames import Pose, exp, yaw_pose
 from fieldkit.store import digest, write_camera, write_tum
 from fieldkit.types import Image
@@ -79,6 +80,8 @@ class TinySource:
         return true
 
     def waypoints(self) -> Sequence[SourceWaypoint]:
+        if self.count > 20:
+            raise DatasetError(f"20 places; expected at least {self.count}", hint="ask for fewer waypoints")
         rng = np.random.default_rng([self.seed, 1])
         sigmas = np.array([0.003, 0.003, 0.02, 0.05, 0.05, 0.01])
         result = []
@@ -91,6 +94,8 @@ class TinySource:
                 hand = aim([0.2 * np.cos(yaw), 0.2 * np.sin(yaw), 0.5], float(yaw), pitch_rad=0.1)
                 views.append(SourceView(name, "stowed" if name == "stowed" else "sweep", hand, body * hand))
             prior = body * exp(sigmas * rng.standard_normal(6)).inv()
+            if self.fault == "twins":
+                views.append(views[-1])
             following = f"w{(k + 1) % self.count}"
             result.append(
                 SourceWaypoint(f"w{k}", body, prior, np.diag(sigmas**2), CAMERA, tuple(views), next=following)
@@ -107,6 +112,20 @@ class TinySource:
         image = cv2.cvtColor(render(self._scene, CAMERA, view.world_from_cam, samples=1).rgb, cv2.COLOR_RGB2GRAY)
         noisy = image + self.noise * rng.standard_normal(image.shape)
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+SOURCE = TinySource()
+RULES = DatasetRules(repeats=2, repeat_share=0.4)
+
+
+def make(out: Path, *sources: TinySource, workers: int = 1, force: bool = False, rules: DatasetRules = RULES) -> None:
+    """Make a dataset of these sources, or of the one that has all the defaults."""
+    make_dataset(sources or [SOURCE], out, described={"seed": 0}, rules=rules, workers=workers, force=force)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Return all files below a folder."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def wall_pose(x: float, y: float, yaw_deg: float) -> Pose:

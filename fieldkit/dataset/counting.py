@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldkit.store.datasets import read_dataset, read_scene, read_shard, scene_path, shard_path
+from fieldkit.store.datasets import read_dataset, read_scene, read_scene_shard, scene_path, shard_path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,20 +35,19 @@ def count_scenes(path: Path) -> tuple[SceneCount, ...]:
 
 
 def _count(path: Path, scene: str) -> SceneCount:
-    planned = read_scene(path, scene).waypoints
-    files = [file for w in planned if (file := shard_path(path, scene, w)).is_file()]
+    entry = read_scene(path, scene)
+    there = [w for w in entry.waypoints if shard_path(path, scene, w).is_file()]
     labels: list[bool] = []
     changed: list[bool] = []
     unsteady: list[bool] = []
-    for file in files:
-        shard = read_shard(file)
+    for waypoint in there:
+        shard = read_scene_shard(path, entry, waypoint)
         labels += [bool(y) for y, kind in zip(shard.label, shard.kinds, strict=True) if kind == "sweep"]
         other = shard.repeat_label != shard.label[shard.repeat_view]
         changed += other.tolist()
         unsteady += [bool(other[shard.repeat_view == v].any()) for v in np.unique(shard.repeat_view)]
-    return SceneCount(
-        scene, len(files), len(planned), len(labels), _share(labels), len(changed), _share(changed), _share(unsteady)
-    )
+    counts = len(there), len(entry.waypoints), len(labels)
+    return SceneCount(scene, *counts, _share(labels), len(changed), _share(changed), _share(unsteady))
 
 
 def _share(values: list[bool]) -> float:

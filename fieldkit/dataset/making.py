@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import multiprocessing
 import os
 import pickle
@@ -18,22 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from fieldkit.dataset import worker
+from fieldkit.dataset.folder import WORK_FOLDER, enter, own, settle, tidy
 from fieldkit.dataset.source import ViewSource
 from fieldkit.errors import DatasetError
-from fieldkit.store import library_versions, refuse_existing
-from fieldkit.store.datasets import (
-    DATASET_FILE,
-    MAPS_FOLDER,
-    DatasetFile,
-    DatasetRules,
-    is_dataset,
-    read_dataset,
-    write_dataset,
-)
-from fieldkit.store.files import plain, saving
+from fieldkit.store import library_versions
+from fieldkit.store.datasets import MAPS_FOLDER, DatasetFile, DatasetRules, scene_path
+from fieldkit.store.files import plain
 
-LOCK_FILE = ".lock"
-# One thread each: as many processes as asked for share the machine, and results do not depend on its processors.
+# One thread each: as many processes as asked for share the machine. What has its own count of threads, as maps have,
+# is told in the worker.
 ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -86,8 +78,9 @@ def make_dataset(
 
     A killed run goes on where it was; the bytes do not depend on kills or the number of ``workers``. ``described``
     are the options of the sources as plain values: they are stored, and have to agree with those of an existing
-    folder. ``force`` makes shards again that were made otherwise and keeps the maps that still fit. Raises
-    DatasetError or StoreError where the folder cannot be used, or a scene cannot be mapped.
+    folder. ``force`` makes the shards of these ``sources`` again that were made otherwise and keeps the maps that still
+    fit; other scenes of the folder stay, or the settings have to be theirs. Raises DatasetError or StoreError where
+    the folder cannot be used, or a scene cannot be read or mapped.
     """
     rules, out = rules or DatasetRules(), Path(out)
     names = [s.name for s in sources]
@@ -98,91 +91,20 @@ def make_dataset(
             raise DatasetError(f"scene {name!r}: cannot name a folder of the dataset", hint="give it another name")
     if workers < 1:
         raise DatasetError(f"{workers} workers; expected at least 1", hint="choose another number")
-    with _own(out):
-        _prepare(out, names, rules, plain(dict(described)), force=force)
+    with own(out):
+        head = DatasetFile(1, tuple(names), rules, plain(dict(described)), library_versions())
+        plan = settle(out, head, force=force)
         scenes = [_Scene(s.name, pickle.dumps(s)) for s in sources]
+        unknown = [s for s in scenes if force or not scene_path(out, s.name).is_file()]
         try:
+            tidy(out, plan.head.scenes)
             with _workers(min(workers, 64), out, rules) as lanes:
-                _Foreman(scenes, lanes, progress).run()
+                foreman = _Foreman(scenes, lanes, progress)
+                # All sources are read before anything is written: one that cannot be used leaves no trace.
+                enter(out, plan, foreman.check(unknown))
+                foreman.run()
         finally:
-            shutil.rmtree(out / worker.WORK_FOLDER, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _own(out: Path) -> Iterator[None]:
-    """Hold the folder alone: two runs at once would do the same work twice."""
-    if not is_dataset(out) and not _holds_only_maps(out):
-        refuse_existing(out, force=False, kind="folder")
-    with saving(out):
-        out.mkdir(parents=True, exist_ok=True)
-        stream = (out / LOCK_FILE).open("w")
-    with stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise DatasetError(f"{out}: another run is making it", hint="wait for it, or end it") from error
-        try:
-            yield
-        finally:
-            with contextlib.suppress(OSError):
-                (out / LOCK_FILE).unlink()
-
-
-def _holds_only_maps(out: Path) -> bool:
-    """Tell whether a folder holds what a run leaves that was killed at once, or maps that were put there."""
-    return out.is_dir() and {p.name for p in out.iterdir()} <= {LOCK_FILE, MAPS_FOLDER, worker.WORK_FOLDER}
-
-
-def _prepare(out: Path, names: list[str], rules: DatasetRules, described: dict[str, Any], *, force: bool) -> None:
-    """Write dataset.toml, or hold the one that is there against what is asked for; clear what a kill left behind."""
-    head = DatasetFile(1, tuple(names), rules, described, library_versions())
-    with saving(out):
-        if is_dataset(out) and force:
-            _clear(out)
-        if is_dataset(out):
-            before = read_dataset(out)
-            _refuse_other(out, before, head)
-            added = tuple(n for n in names if n not in before.scenes)
-            head = DatasetFile(1, (*before.scenes, *added), rules, described, before.versions)
-            if added:
-                write_dataset(out, head)
-        else:
-            write_dataset(out, head)
-        shutil.rmtree(out / worker.WORK_FOLDER, ignore_errors=True)
-        (out / worker.WORK_FOLDER).mkdir()
-        for folder in (out, out / MAPS_FOLDER, *(out / name for name in head.scenes)):
-            for left in folder.glob(".*.*"):
-                left.unlink() if left.is_file() else shutil.rmtree(left)
-
-
-def _clear(out: Path) -> None:
-    """Take away what --force makes again; the maps stay, and are used where their keys fit."""
-    for name in read_dataset(out).scenes:
-        shutil.rmtree(out / name, ignore_errors=True)
-    (out / DATASET_FILE).unlink()
-
-
-def _refuse_other(out: Path, before: DatasetFile, now: DatasetFile) -> None:
-    """Raise DatasetError that names the first setting which differs from that of the existing folder."""
-    old, new = (_leaves({"rules": h.rules, "source": h.source, "versions": h.versions}) for h in (before, now))
-    for key in {**old, **new}:
-        if old.get(key) != new.get(key):
-            raise DatasetError(
-                f"{out}: was made with other settings: {key} is {old.get(key, 'not set')}; now it would be "
-                f"{new.get(key, 'not set')}",
-                hint="give --force to make it again (maps that still fit are kept), or choose another --out",
-            )
-
-
-def _leaves(values: Any, *, prefix: str = "") -> dict[str, Any]:
-    """Return nested plain values by their dotted places; what is None is as good as missing."""
-    result: dict[str, Any] = {}
-    for key, value in plain(values).items():
-        if isinstance(value, dict):
-            result |= _leaves(value, prefix=f"{prefix}{key}.")
-        elif value is not None:
-            result[prefix + key] = list(value) if isinstance(value, tuple) else value
-    return result
+            shutil.rmtree(out / WORK_FOLDER, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -221,13 +143,25 @@ class _Foreman:
 
     def __init__(self, scenes: list[_Scene], lanes: list[_Lane], progress: Callable[[Progress], None] | None) -> None:
         self._scenes, self._lanes, self._progress = scenes, lanes, progress
-        self._waiting = list(scenes)
+        self._waiting: list[_Scene] = []
+        self._ask: type[worker.Check | worker.Open] = worker.Check
+        self._keys: dict[str, str] = {}
         self._begin = time.monotonic()
         self._images = self._made = 0
         self._first_shard: float | None = None
 
+    def check(self, scenes: Sequence[_Scene]) -> Mapping[str, str]:
+        """Have the sources of scenes read; return their views keys."""
+        self._waiting, self._ask = list(scenes), worker.Check
+        self._work()
+        return self._keys
+
     def run(self) -> None:
         """Work until every shard of every scene is there."""
+        self._waiting, self._ask = list(self._scenes), worker.Open
+        self._work()
+
+    def _work(self) -> None:
         while True:
             for lane in self._lanes:
                 if not lane.busy:
@@ -245,9 +179,11 @@ class _Foreman:
         scene = lane.scene
         if scene is None or not scene.todo:
             if self._waiting:
-                scene = self._waiting.pop(0)
+                # A worker that has read this scene already need not read it again.
+                scene = next((s for s in self._waiting if s is lane.scene), self._waiting[0])
+                self._waiting.remove(scene)
                 lane.scene, lane.busy = scene, scene.name
-                self._send(lane, worker.Open(scene.name, scene.source))
+                self._send(lane, self._ask(scene.name, scene.source))
                 return
             # A second worker pays the opening of a scene: not for a shard or two.
             left = [s for s in self._scenes if len(s.todo) > 2]
@@ -259,7 +195,7 @@ class _Foreman:
         lane.busy, lane.making = f"{scene.name}/{waypoint}", True
         self._send(lane, worker.Make(scene.name, scene.source, waypoint))
 
-    def _send(self, lane: _Lane, request: worker.Open | worker.Make) -> None:
+    def _send(self, lane: _Lane, request: worker.Check | worker.Open | worker.Make) -> None:
         try:
             lane.pipe.send(request)
         except OSError as error:
@@ -278,6 +214,9 @@ class _Foreman:
                 if line is None:
                     raise RuntimeError(f"a worker of the dataset failed at {lane.busy}:\n{trace}")
                 raise DatasetError(line)
+            case worker.Checked(key):
+                assert lane.scene is not None
+                self._keys[lane.scene.name] = key
             case worker.Opened(waypoints, done):
                 assert lane.scene is not None
                 lane.scene.todo = [w for w in waypoints if w not in set(done)]

@@ -22,7 +22,7 @@ from fieldkit.store.datasets import (
     read_dataset,
     read_gauge,
     read_scene,
-    read_shard,
+    read_scene_shard,
     row_pose,
     scene_path,
     shard_path,
@@ -124,7 +124,8 @@ def _scenes(path: Path, protocol: Protocol) -> list[_Scene]:
         if entry is None or done < len(planned):
             raise DatasetError(
                 f"{path}: scene {name!r} has {done} of {len(planned) or 'its'} waypoints; expected all of them",
-                hint="give the command that makes the dataset again: it goes on where it was",
+                hint="give the command that makes the dataset again: it goes on where it was; a scene without "
+                "waypoints is left out where it is not named",
             )
         result.append(_Scene(path, entry, name))
     return result
@@ -151,13 +152,7 @@ def _replay_scene(scene: _Scene, protocol: Protocol, *, progress: Progress | Non
     policies.check_map(scene_map, protocol)
     gauge = read_gauge(map_path(folder, entry))
     look = policies.Looker(scene_map, protocol)
-    shards = [read_shard(shard_path(folder, entry.name, w)) for w in entry.waypoints]
-    for shard in shards:
-        if shard.key != entry.views_key:
-            raise DatasetError(
-                f"{shard_path(folder, entry.name, shard.waypoint)}: was made with other settings than {entry.name}",
-                hint="remove it and finish the dataset",
-            )
+    shards = [read_scene_shard(folder, entry, w) for w in entry.waypoints]
     priors = [_prior(shard) for shard in shards]
     visits = [Visit(s.waypoint, 0, 0, (), s.next) for s in shards]
     ahead = forward_directions(visits, priors, rules=protocol.candidates)

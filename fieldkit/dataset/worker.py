@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import pickle
 import shutil
@@ -10,13 +11,14 @@ import signal
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing import connection, parent_process
 from pathlib import Path
 
 import cv2
 
 from fieldkit import maps
+from fieldkit.dataset.folder import WORK_FOLDER
 from fieldkit.dataset.looking import Studio
 from fieldkit.dataset.source import SourceWaypoint, ViewSource
 from fieldkit.errors import DatasetError, FieldkitError
@@ -28,8 +30,10 @@ from fieldkit.store.datasets import (
     GaugeFile,
     SceneFile,
     gauge_path,
+    is_plain,
     read_gauge,
     read_scene,
+    read_scene_shard,
     scene_path,
     shard_path,
     write_gauge,
@@ -39,9 +43,23 @@ from fieldkit.store.datasets import (
 from fieldkit.store.files import saving
 
 Tell = Callable[[str, int, int], None]
-WORK_FOLDER = ".work"
 # A map's cameras may lie off the true ones (rms) by this share of the bound within which a view counts as localized.
 MOST_WARP = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """Read the source of a scene, and write nothing; answered by `Checked`."""
+
+    scene: str
+    source: bytes
+
+
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    """The source of a scene can be used; the key of what would be made of it."""
+
+    views_key: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +129,13 @@ def serve(pipe: connection.Connection, out: Path, rules: DatasetRules) -> None:
                 # The scene before goes before the next one comes: both would need twice the memory.
                 desk = None
                 desk = Desk(request.source, out, rules, lambda *step: pipe.send(Step(*step)))
-            pipe.send(desk.opened() if isinstance(request, Open) else desk.make(request.waypoint))
+            match request:
+                case Check():
+                    pipe.send(desk.checked())
+                case Open():
+                    pipe.send(desk.opened())
+                case Make():
+                    pipe.send(desk.make(request.waypoint))
         except FieldkitError as error:
             pipe.send(Failed(f"{request.scene}: {error}", ""))
         except OSError as error:
@@ -130,38 +154,53 @@ def _end_with_parent() -> None:
 
 
 class Desk:
-    """One opened scene: its source, its waypoints, its map and its localizer."""
+    """One scene: its source and its waypoints, and once it is opened its map and its localizer."""
 
     def __init__(self, source_bytes: bytes, out: Path, rules: DatasetRules, tell: Tell) -> None:
         self.source_bytes = source_bytes
         self._source: ViewSource = pickle.loads(source_bytes)
         self._out, self._rules, self._tell = out, rules, tell
-        name = self._source.name
-        tell(f"{name}: scene", 0, 1)
+        tell(f"{self._source.name}: scene", 0, 1)
         self._key = views_key(self._source, rules)
-        self._waypoints = {w.id: w for w in self._source.waypoints()}
+        waypoints = tuple(self._source.waypoints())
+        _refuse_waypoints(self._source.name, waypoints)
+        self._waypoints = {w.id: w for w in waypoints}
+
+    def checked(self) -> Checked:
+        """Return the key of the scene's views."""
+        return Checked(self._key)
+
+    def opened(self) -> Opened:
+        """Return the waypoints, and which of them are done, after having read these."""
+        name = self._source.name
+        assert self._studio
+        entry = read_scene(self._out, name)
+        done = tuple(w for w in self._waypoints if shard_path(self._out, name, w).is_file())
+        for waypoint in done:
+            read_scene_shard(self._out, entry, waypoint)
+        return Opened(tuple(self._waypoints), done)
+
+    @functools.cached_property
+    def _studio(self) -> Studio:
+        """The scene with its map; both are written where they are missing."""
+        out, name, rules = self._out, self._source.name, self._rules
         key = map_key(self._source, rules)
         folder = out / MAPS_FOLDER / f"{name}-{key[:16]}.map"
         # Asked before the map is made, which takes minutes.
         _refuse_other(out, name, mapping_key=key, views_key=self._key)
-        gauge = build_scene_map(self._source, folder, rules, tell)
+        gauge = build_scene_map(self._source, folder, rules, self._tell)
         _refuse_folded(folder, gauge, rules)
         scene_map = maps.load_map(folder)
-        self._studio = Studio(self._source, scene_map, gauge, rules)
+        studio = Studio(self._source, scene_map, gauge, rules)
         entry = SceneFile(1, name, key, self._key, folder.name, scene_map.digest, tuple(self._waypoints))
         if not scene_path(out, name).is_file():
             write_scene(out, entry)
         elif read_scene(out, name) != entry:
             raise DatasetError(
                 f"{folder}: was made again and is another map now; expected the one that {out / name} was localized in",
-                hint="give --force to make the views again",
+                hint=f"remove {out / name} to make the views again",
             )
-
-    def opened(self) -> Opened:
-        """Return the waypoints, and which of them are done."""
-        name = self._source.name
-        done = tuple(w for w in self._waypoints if shard_path(self._out, name, w).is_file())
-        return Opened(tuple(self._waypoints), done)
+        return studio
 
     def make(self, waypoint: str) -> Made:
         """Make the shard of a waypoint and write it."""
@@ -169,6 +208,19 @@ class Desk:
         shard = self._studio.shard(chosen, key=self._key)
         write_shard(shard_path(self._out, self._source.name, waypoint), shard)
         return Made(len(shard.view_ids) + len(shard.repeat_view))
+
+
+def _refuse_waypoints(name: str, waypoints: Sequence[SourceWaypoint]) -> None:
+    """Raise DatasetError where a source has nothing to look at, or names it so that it cannot be told apart."""
+    ids = [w.id for w in waypoints]
+    twice = [f"waypoint {i!r}" for i in ids if ids.count(i) > 1 or not is_plain(i)]
+    for waypoint in waypoints:
+        views = [v.id for v in waypoint.views]
+        twice += [f"view {waypoint.id}/{v}" for v in views if views.count(v) > 1]
+    if twice:
+        raise DatasetError(f"scene {name!r}: {twice[0]} is there twice, or no file can be named so; expected each once")
+    if not ids or not all(w.views for w in waypoints):
+        raise DatasetError(f"scene {name!r}: has no waypoint, or one without a view; expected some of both")
 
 
 def _refuse_other(out: Path, name: str, **keys: str) -> None:
@@ -209,10 +261,14 @@ def build_scene_map(source: ViewSource, path: Path, rules: DatasetRules, tell: T
 
     The gauge needs the true mapping poses, which are not kept: it is stored beside the map, and before it.
     """
-    if path.is_dir() and gauge_path(path).is_file():
+    if path.is_dir():
+        if not gauge_path(path).is_file():
+            raise DatasetError(
+                f"{path}: has no {gauge_path(path).name} beside it; expected it, too: how the map lies in the world",
+                hint="put it there, or remove the map to make it again",
+            )
         return _read_gauge(path)
     with saving(path):
-        shutil.rmtree(path, ignore_errors=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f"{source.name}-"))
     try:
@@ -223,6 +279,8 @@ def build_scene_map(source: ViewSource, path: Path, rules: DatasetRules, tell: T
             work / "mapping",
             work / path.name,
             feature=rules.feature,
+            # As many maps as workers may be made at once; the number of threads does not change a map.
+            options=maps.MapOptions(n_threads=1),
             progress=lambda step, done, total: tell(f"{source.name}: map, {step}", done, total),
         )
         gauge = maps.fit_gauge(maps.load_map(work / path.name), true)

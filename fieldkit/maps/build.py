@@ -47,7 +47,8 @@ class MapOptions:
     """Settings of map building; the defaults suit 50..500 images of rooms.
 
     ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
-    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches.
+    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. ``n_threads`` is by
+    default the number of processors; it does not change the map, and is no part of what the options are told by.
     Raises MapError when a length or a count is not positive.
     """
 
@@ -63,10 +64,13 @@ class MapOptions:
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
+    n_threads: int | None = dataclasses.field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("voxel_m", "truncation_voxels", "max_depth_m", "ratio", "max_keypoints"):
             positive(name, getattr(self, name))
+        if self.n_threads is not None:
+            positive("n_threads", self.n_threads)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +129,9 @@ def build_map(
     clock.lap("extract")
     pairs, matches, disbelieved = _match_all(walk, features, options, seed, tell)
     clock.lap("match")
-    model = reconstruct(walk.images, features, pairs, matches, seed=seed, progress=tell)
+    model = reconstruct(
+        walk.images, features, pairs, matches, seed=seed, progress=tell, n_threads=options.n_threads or threads()
+    )
     clock.lap("reconstruct")
     sfm_poses = _registered(walk, model, options)
     alignment, warnings = _align(walk, model, sfm_poses, options, seed)
@@ -158,7 +164,7 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
         return extract(grey, feature=feature, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size)
 
     found = []
-    with ThreadPoolExecutor(threads()) as pool:
+    with ThreadPoolExecutor(options.n_threads or threads()) as pool:
         for done, result in enumerate(pool.map(one, range(len(walk.images))), start=1):
             found.append(result)
             tell("extract", done, len(walk.images))
@@ -173,7 +179,11 @@ def _match_all(
         walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
     )
     matches = match_pairs(
-        pairs, features, ratio=options.ratio, progress=lambda n: tell("match", n, len(pairs)), n_threads=threads()
+        pairs,
+        features,
+        ratio=options.ratio,
+        progress=lambda n: tell("match", n, len(pairs)),
+        n_threads=options.n_threads or threads(),
     )
     if options.slam is None:
         return pairs, matches, []

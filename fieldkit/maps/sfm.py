@@ -50,14 +50,19 @@ def write_database(
                 database.write_matches(a + 1, b + 1, found_matches)
 
 
-def verify_geometry(path: Path, *, seed: int) -> int:
-    """Verify all matches of a database by two-view geometry; return the number of pairs that hold."""
+def verify_geometry(path: Path, *, seed: int, n_threads: int = -1) -> int:
+    """Verify all matches of a database by two-view geometry; return the number of pairs that hold.
+
+    Pairs are shared among ``n_threads`` threads, -1 for all processors; what is found does not depend on it.
+    """
+    sharing = pycolmap.GeometricVerifierOptions()
+    sharing.num_threads = n_threads
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = _MIN_MATCHES
     options.detect_watermark = False
     options.ransac.random_seed = seed
     options.ransac.num_threads = 1
-    pycolmap.geometric_verification(path, two_view_geometry_options=options)
+    pycolmap.geometric_verification(path, sharing, two_view_geometry_options=options)
     with contextlib.closing(pycolmap.Database.open(path)) as database:
         return int(database.num_verified_image_pairs())
 
@@ -70,6 +75,7 @@ def reconstruct(
     *,
     seed: int,
     progress: Callable[[str, int, int], None],
+    n_threads: int = -1,
 ) -> pycolmap.Reconstruction:
     """Reconstruct cameras and points; return the model with the most images, in SfM's own scale and frame.
 
@@ -80,7 +86,7 @@ def reconstruct(
         database = Path(folder) / "database.db"
         write_database(database, images, features, pairs, matches)
         progress("verify", 0, len(pairs))
-        n_verified = verify_geometry(database, seed=seed)
+        n_verified = verify_geometry(database, seed=seed, n_threads=n_threads)
         progress("verify", len(pairs), len(pairs))
         if not n_verified:
             raise MapError(

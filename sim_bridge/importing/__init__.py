@@ -28,8 +28,12 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 TALLEST_M, SMALLEST_M, LARGEST_M = 40.0, 1.2, 1000.0
 # Coordinates far from zero (of a map's grid) lose their last digits.
 FAR_M = 1000.0
-# How much more y than z has to look like up before that is said.
-SURE = 0.25
+# No face shows so many repeats of its texture: a floor of 100 m with tiles of 10 cm.
+MOST_SPAN = 1000.0
+# How much more y than z has to look like up before that is said, and before it is refused.
+DOUBT, SURE = 0.1, 0.6
+# Rooms are this high and more, and hardly higher than that.
+LOW_M, HIGH_M = 2.2, 3.5
 
 _log = logging.getLogger(__name__)
 
@@ -87,8 +91,8 @@ def _on_floor(path: Path, scene: Scene, floor: Floor | None) -> Scene:
     if floor is None or floor.driven_m2 < SMALLEST_M2:
         found = "no floor" if floor is None else f"largest free disc {floor.widest_m:.2f} m in radius"
         raise SynthesisError(
-            f"{path}: no free floor for a robot ({found}); expected {SMALLEST_M2:g} m2 and more for a disc of "
-            f"{ROBOT_RADIUS_M:g} m",
+            f"{path}: no free floor above the robot's width ({found}); expected {SMALLEST_M2:g} m2 and more for a "
+            f"disc of {ROBOT_RADIUS_M:g} m",
             hint="check the mesh's floor, its unit (--unit) and up axis (--up)",
         )
     low, high = scene.bounds
@@ -112,11 +116,31 @@ def _checked(path: Path, parts: list[Part]) -> list[Part]:
         raise SynthesisError(
             f"{path}: {wrong} of {total} vertices are not finite; expected numbers", hint="repair or export it again"
         )
+    _check_repeats(path, parts)
     kept = [_with_area(p) for p in parts]
     kept = [p for p in kept if len(p.faces)]
     if not kept:
         raise SynthesisError(f"{path}: a mesh whose faces have no area; expected triangles", hint="export it again")
     return kept
+
+
+def _check_repeats(path: Path, parts: Sequence[Part]) -> None:
+    """Raise SynthesisError for texture coordinates that cannot be meant: a face with too many repeats of its image."""
+    spans = [np.zeros(0)]
+    for part in parts:
+        if part.uv is not None:
+            low, high = part.uv.min(axis=1), part.uv.max(axis=1)
+            # An endless coordinate is no number less itself.
+            with np.errstate(invalid="ignore"):
+                spans.append(np.nan_to_num((high - low).max(axis=1), nan=np.inf, posinf=np.inf))
+    every = np.concatenate(spans)
+    wrong = int((every > MOST_SPAN).sum())
+    if wrong:
+        raise SynthesisError(
+            f"{path}: {wrong} of {len(every)} faces repeat their texture up to {every.max():.3g} times; "
+            f"expected {MOST_SPAN:g} at most",
+            hint="repair the texture coordinates, or export it again",
+        )
 
 
 def _with_area(part: Part) -> Part:
@@ -158,19 +182,24 @@ def _check_size(path: Path, size: Array, options: MeshOptions) -> None:
 
 
 def _check_axis(path: Path, scene: Scene, floor: Floor | None) -> None:
-    """Raise SynthesisError where the mesh has much more floor, and less height, with y up than with z up."""
-    raised = dataclasses.replace(scene, vertices=_raised(scene.vertices))
-    other = find_floor(raised)
+    """Raise SynthesisError where y is clearly up: with it there is more floor, and a likelier ceiling above it."""
+    other = find_floor(dataclasses.replace(scene, vertices=_raised(scene.vertices)))
     if other is None or other.driven_m2 < SMALLEST_M2:
         return
-    size = scene.bounds[1] - scene.bounds[0]
-    here = max(floor.driven_m2 if floor else 0.0, 0.1)
-    evidence = np.log(other.driven_m2 / here) + np.log(size[2] / size[1])
+    area, height = (floor.area_m2, floor.height_m) if floor is not None else (0.0, LOW_M)
+    evidence = np.log(other.area_m2 / max(area, 0.1)) + _unlikely(height) - _unlikely(other.height_m)
+    seems = f"{other.area_m2:.0f} m2 of floor {other.height_m:.1f} m high; with z up {area:.0f} m2, {height:.1f} m"
     if evidence > SURE:
         raise SynthesisError(
-            f"{path}: y seems to be up ({other.driven_m2:.0f} m2 of free floor, {here:.0f} with z up); expected z up",
-            hint="give --up y, or --up z if z is up",
+            f"{path}: y seems to be up ({seems}); expected z up", hint="give --up y, or --up z if z is up"
         )
+    if evidence > DOUBT and floor is not None and floor.driven_m2 >= SMALLEST_M2:
+        _log.warning("%s: taken with z up, but y may be up (%s): then give --up y", path, seems)
+
+
+def _unlikely(height_m: float) -> float:
+    """Return how unlikely a room of this height is: steeply so below LOW_M, slowly above HIGH_M."""
+    return float(3.0 * np.log(max(LOW_M / max(height_m, 0.1), 1.0)) + np.log(max(height_m / HIGH_M, 1.0)))
 
 
 def _raised(vertices: Array) -> Array:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter1d, label
 
+from sim_bridge.importing.shelter import Shelter, faces_agree, look_around
 from sim_bridge.mesh import Clearance, Scene
 from sim_bridge.rendering.kernels import kernel
 
@@ -22,10 +24,13 @@ SAG_M = 0.08
 # A robot that drives is a disc of this radius.
 ROBOT_RADIUS_M = 0.36
 LEVEL_BIN_M = 0.02
+# Levels closer than 0.3 m are one.
+APART_BINS = 15
 MOST_LEVELS = 8
-# Floor lies indoors where this share of level rays ends at something: a roof or a lawn does not.
-ENCLOSED_SHARE = 0.66
 SMALLEST_M2 = 1.0
+# What lies by more than this share above a room is its ceiling.
+ROOF_SHARE = 0.25
+STOREY_M = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,6 +38,7 @@ class Floor:
     """A floor: its ``level_m``, the clearance on its largest connected part, and that part's rectangle and area.
 
     ``driven_m2`` is the area of the places where the middle of a robot can be, ``widest_m`` the largest free radius.
+    ``area_m2`` is the area of the whole level, all parts with what stands on them; ``height_m`` the room above it.
     """
 
     level_m: float
@@ -41,13 +47,16 @@ class Floor:
     free_m2: float
     driven_m2: float
     widest_m: float
+    area_m2: float
+    height_m: float
 
 
 def find_floor(scene: Scene) -> Floor | None:
     """Return the floor with the largest connected area for a robot, None where there is no floor at all.
 
     Levels are where much of the mesh is horizontal. Floor is free where nothing lies between SILL_M and HEAD_M above
-    it. Floor indoors, with walls around, is preferred to any other.
+    it. Floor indoors, with walls around, is preferred to any other; a roof is none, and neither is the inside of
+    something solid, unless the whole mesh shows its backs.
     """
     corners = scene.vertices[scene.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -55,32 +64,91 @@ def find_floor(scene: Scene) -> Floor | None:
     lying = np.abs(cross[:, 2]) > 0.7 * twice
     levels = _levels(corners[lying, :, 2].mean(axis=1), 0.5 * twice[lying])
     plans = [_Plan.of(corners, corners[lying], level) for level in levels]
+    shelters = _shelters(scene, plans)
     best: Floor | None = None
-    for indoors in (True, False):
-        for plan in plans:
-            floor = plan.floor(scene if indoors else None)
-            if best is None or (floor.driven_m2, floor.widest_m) > (best.driven_m2, best.widest_m):
+    for allowed in _preferences(plans, shelters):
+        for plan, shelter, where in zip(plans, shelters, allowed, strict=True):
+            floor = plan.floor(where, shelter.room_m)
+            if best is None or _rank(floor) > _rank(best):
                 best = floor
         if best is not None and best.driven_m2 >= SMALLEST_M2:
             break
     return best
 
 
+def _rank(floor: Floor) -> tuple[float, float, float]:
+    return floor.driven_m2, floor.widest_m, floor.area_m2
+
+
+def _shelters(scene: Scene, plans: Sequence[_Plan]) -> list[Shelter]:
+    """Return what is around each plan; nothing is hollow where the mesh's faces do not agree about their fronts."""
+    found = [
+        look_around(scene, p.ground, free=p.free, level_m=p.level_m, origin_xy=p.origin_xy, cell_m=CELL_M)
+        for p in plans
+    ]
+    if not any(s.hollow.any() for s in found) or faces_agree(scene):
+        return found
+    return [dataclasses.replace(s, indoors=s.indoors | s.hollow, hollow=np.zeros_like(s.hollow)) for s in found]
+
+
+def _preferences(plans: Sequence[_Plan], shelters: Sequence[Shelter]) -> Iterator[list[Mask]]:
+    """Yield where on each plan the floor may be: indoors, else not on a roof; last inside, for a mesh inside out."""
+    yield [s.indoors for s in shelters]
+    yield [p.ground & ~s.hollow & ~_roof(p, plans, shelters) for p, s in zip(plans, shelters, strict=True)]
+    if max((float(s.indoors.sum()) * CELL_M**2 for s in shelters), default=0.0) < SMALLEST_M2:
+        yield [s.indoors | s.hollow for s in shelters]
+
+
+def _roof(plan: _Plan, plans: Sequence[_Plan], shelters: Sequence[Shelter]) -> Mask:
+    """Return the parts of a plan that lie above a room, or above what would be one in a mesh inside out."""
+    above = np.zeros(plan.free.shape, np.bool_)
+    middle = [o + (np.arange(n) + 0.5) * CELL_M for o, n in zip(plan.origin_xy, plan.free.shape, strict=True)]
+    for lower, shelter in zip(plans, shelters, strict=True):
+        if lower.level_m > plan.level_m - STOREY_M:
+            continue
+        room = shelter.indoors | (shelter.hollow & lower.free)
+        cells = [np.floor((m - o) / CELL_M).astype(int) for m, o in zip(middle, lower.origin_xy, strict=True)]
+        i, j = (np.flatnonzero((c >= 0) & (c < n)) for c, n in zip(cells, room.shape, strict=True))
+        above[np.ix_(i, j)] |= room[np.ix_(cells[0][i], cells[1][j])]
+    parts, count = label(plan.free, np.ones((3, 3)))
+    over, whole = (np.bincount(parts.ravel(), weights=w, minlength=count + 1) for w in (above.ravel(), None))
+    roof: Mask = (over > ROOF_SHARE * whole)[parts]
+    return np.where(parts > 0, roof, above)
+
+
 def _levels(heights: Array, areas: Array) -> list[float]:
-    """Return heights at which horizontal faces have the most area, at least 0.3 m apart."""
+    """Return heights at which horizontal faces have the most area, APART_BINS bins apart."""
     if not len(heights):
         return []
     low = float(heights.min()) - 0.5
     bins = ((heights - low) / LEVEL_BIN_M).astype(int)
-    area = gaussian_filter1d(np.bincount(bins, weights=areas, minlength=int(bins.max()) + 25), 1.5)
+    total = np.bincount(bins, weights=areas, minlength=int(bins.max()) + 25).astype(np.float64)
+    area: Array = gaussian_filter1d(total, 1.5)
     found: list[float] = []
     least = 0.1 * area.max()
     while len(found) < MOST_LEVELS and area.max() > least:
-        peak = int(np.argmax(area))
+        peak = _upper(area, int(np.argmax(area)))
         near = np.abs(heights - (low + (peak + 0.5) * LEVEL_BIN_M)) < 3 * LEVEL_BIN_M
-        found.append(_median(heights[near], areas[near]))
-        area[max(0, peak - 15) : peak + 16] = 0.0
+        found.append(_surface(heights[near], areas[near]))
+        area[max(0, peak - APART_BINS) : peak + APART_BINS + 1] = 0.0
     return found
+
+
+def _upper(area: Array, peak: int) -> int:
+    """Return the bin of the highest level near a peak with half of its area: the top of a slab, not its underside."""
+    for k in range(min(peak + APART_BINS, len(area) - 2), peak, -1):
+        if area[k] >= max(0.5 * area[peak], area[k - 1]) and area[k] > area[k + 1]:
+            return k
+    return peak
+
+
+def _surface(heights: Array, areas: Array) -> float:
+    """Return the height of a level: the median of its faces, or of the upper ones where they are those of a slab."""
+    middle = _median(heights, areas)
+    upper = heights > middle + 0.75 * LEVEL_BIN_M
+    if areas[upper].sum() >= 0.5 * areas[~upper].sum():
+        return _median(heights[upper], areas[upper])
+    return middle
 
 
 def _median(values: Array, weights: Array) -> float:
@@ -91,10 +159,11 @@ def _median(values: Array, weights: Array) -> float:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Plan:
-    """A level of a mesh from above: which cells are free floor, bool[nx,ny]."""
+    """A level of a mesh from above: which cells are floor, ``ground``, and which of them are free, bool[nx,ny]."""
 
     level_m: float
     origin_xy: tuple[float, float]
+    ground: Mask
     free: Mask
 
     @classmethod
@@ -108,11 +177,11 @@ class _Plan:
         _mark(corners, (level_m + SILL_M, level_m + HEAD_M), origin, CELL_M, taken)
         # A scan has holes where nobody looked.
         floor |= np.asarray(binary_closing(np.pad(floor, 3), np.ones((3, 3), np.bool_), iterations=3))[3:-3, 3:-3]
-        return cls(level_m, origin, floor & ~taken)
+        return cls(level_m, origin, floor, floor & ~taken)
 
-    def floor(self, walls: Scene | None) -> Floor:
-        """Return the largest part through which a robot can drive; with ``walls`` only what they enclose."""
-        free = self.free if walls is None else self.free & self._enclosed(walls)
+    def floor(self, allowed: Mask, room_m: Array) -> Floor:
+        """Return the largest part of where it is allowed through which a robot can drive."""
+        free, whole = self.free & allowed, self.ground & allowed
         drivable = _room(free) >= ROBOT_RADIUS_M
         parts, count = label(drivable, np.ones((3, 3)))
         sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
@@ -138,23 +207,10 @@ class _Plan:
             free_m2=float(free.sum()) * CELL_M**2,
             driven_m2=float(sizes[best - 1]) * CELL_M**2 if count else 0.0,
             widest_m=float(room.max()),
+            area_m2=float(whole.sum()) * CELL_M**2,
+            # Where tables stand there is less.
+            height_m=float(np.percentile(room_m[whole], 75)) if whole.any() else 0.0,
         )
-
-    def _enclosed(self, walls: Scene) -> Mask:
-        """Return whether cells lie indoors, judged on squares of five cells."""
-        step = 5
-        shape = self.free.shape
-        blocks = np.pad(self.free, [(0, -n % step) for n in shape])
-        squares = blocks.reshape(blocks.shape[0] // step, step, blocks.shape[1] // step, step).any(axis=(1, 3))
-        where = np.argwhere(squares)
-        angles = np.linspace(0.0, 2 * np.pi, 16, endpoint=False) + 0.1
-        rays = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(16)])
-        middle = np.asarray(self.origin_xy) + (where + 0.5) * step * CELL_M
-        eyes = np.column_stack([middle, np.full(len(middle), self.level_m + 1.1)])
-        inside = np.zeros(squares.shape, np.bool_)
-        hit = np.isfinite(walls.intersect(np.repeat(eyes, 16, axis=0), np.tile(rays, (len(eyes), 1))))
-        inside[tuple(where.T)] = hit.reshape(-1, 16).mean(axis=1) >= ENCLOSED_SHARE
-        return np.repeat(np.repeat(inside, step, axis=0), step, axis=1)[: shape[0], : shape[1]]
 
 
 def _room(free: Mask) -> Array:

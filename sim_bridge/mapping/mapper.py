@@ -50,7 +50,7 @@ class WalkOptions:
     """
 
     stations: int | None = None
-    covers: float = 0.65
+    covers: float = 0.62
     laps: float = 1.04
     height_m: float = 1.65
     look_around_deg: float = 25.0

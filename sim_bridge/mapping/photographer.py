@@ -103,7 +103,7 @@ def _viewpoints(
     if len(chosen) < count:
         raise SynthesisError(
             f"only {len(chosen)} places from which tag {tag.id} can be photographed; expected {count}",
-            hint="use another seed",
+            hint="use another seed, or in a mesh of your own fewer waypoints or more bare wall",
         )
     return chosen
 

@@ -38,10 +38,10 @@ class ChangeOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
 
     version: Literal[1] = 1
-    moved: Share = 0.35
-    removed: Share = 0.07
-    added: Share = 0.07
-    exchanged_pictures: Share = 0.1
+    moved: Share = 0.25
+    removed: Share = 0.06
+    added: Share = 0.06
+    exchanged_pictures: Share = 0.08
     removed_pictures: Share = 0.05
     lamps_off: Share = 0.15
     farthest_m: Metres = 0.9

@@ -51,23 +51,26 @@ def outer_walls(
     hall: Hall,
     faces: Sequence[int],
     *,
-    windows: Mapping[int, Sequence[Opening]],
+    openings: Mapping[int, Sequence[Opening]],
     trim: int | None,
     power: float,
     view: int | None = None,
     cell_m: float = 0.25,
 ) -> None:
-    """Add the four outer walls with textures of their inner faces, and windows in them of a power per m2."""
+    """Add the four outer walls with textures of their inner faces; openings above the floor become windows.
+
+    ``power`` is a window's light per m2.
+    """
     outside = paint(build, (120, 120, 120))
     rim = paint(build, (88, 90, 94))
     for side in range(4):
         start, end = hall.line(side)
-        holes = windows.get(side, ())
+        holes = openings.get(side, ())
         wall(
             build, start, end, height_m=hall.height_m, openings=holes, left=faces[side], right=outside, trim=trim,
             cell_m=cell_m,
         )  # fmt: skip
-        for hole in holes:
+        for hole in (hole for hole in holes if hole.bottom_m > 0.0):
             area = hole.width_m * (hole.top_m - hole.bottom_m)
             bars = max(round(hole.width_m / 1.1) - 1, 0)
             window(build, start, end, hole, power=power * area, texture=view, frame=rim, bars=bars)

@@ -1,4 +1,4 @@
-"""The laboratory: a wet laboratory with fume hoods and two islands, an instrument room, a short corridor between.
+"""The laboratory: a wet laboratory with fume hoods and two islands, an instrument room, a short corridor, a dark room.
 
 The plan, in metres, with x to the east (0..11.4) and y to the north (0..8):
 
@@ -10,8 +10,10 @@ The plan, in metres, with x to the east (0..11.4) and y to the north (0..8):
     | s                         c   |           c  |
     |                           h   +-------   --h-+   1.8
     | gas                              corridor    |
-    +------ windows ----------------+--------------+   0
-    0                              7.0           11.4
+    +------ windows ----------------+--   ----+----+   0
+                                    | dark room |
+                                    +-----------+     -3.4
+    0                              7.0         9.9 11.4
 """
 
 from __future__ import annotations
@@ -28,13 +30,16 @@ from sim_bridge.scenes.forms import hang, moved, paint, upright
 from sim_bridge.scenes.halls import EAST, NORTH, SOUTH, WEST, Hall, lamps, outer_walls
 from sim_bridge.scenes.laboratory_furniture import Ware, px
 from sim_bridge.scenes.office_prints import cork, fronts
-from sim_bridge.scenes.plan import Opening, outside, slab, wall, wall_frame
+from sim_bridge.scenes.plan import THICKNESS_M, Opening, outside, slab, wall, wall_frame
 from sim_bridge.scenes.prints import blank, ceiling_grid, upright_stripes
+from sim_bridge.scenes.side_rooms import Finish, SideRoom, side_room, union
 
 HALL = Hall(11.4, 8.0, 3.0)
 DIVIDER_X, FRONT_Y = 7.0, 1.8
 _FLOOR_PX_PER_M = 140
 _WINDOW_POWER, _LAMP_POWER = 1.5, 4.0
+_DARK = SideRoom((7.0, -3.4, 9.9, -THICKNESS_M), NORTH, ((7.0, -1.46), (8.8, -1.46)), HALL.height_m)
+_DARK_DOOR = Opening(8.0, 1.1)
 _DIVIDER = ((DIVIDER_X, 0.0), (DIVIDER_X, HALL.width_m))
 _FRONT = ((DIVIDER_X, FRONT_Y), (HALL.length_m, FRONT_Y))
 
@@ -50,8 +55,10 @@ def laboratory(seed: int) -> Blueprint:
     _wet_walls(build, rng, look)
     _instrument_room(build, rng, look)
     _corridor(build, rng, look)
-    outside(build, HALL.bounds, [HALL.bounds])
-    return build.blueprint(floor_bounds=HALL.bounds)
+    _dark_room(build, rng, look)
+    bounds = union(HALL.bounds, _DARK.floor)
+    outside(build, bounds, [HALL.bounds, _DARK.floor])
+    return build.blueprint(floor_bounds=bounds)
 
 
 def _walls(build: Builder, rng: np.random.Generator) -> None:
@@ -64,7 +71,8 @@ def _walls(build: Builder, rng: np.random.Generator) -> None:
     trim = build.plain(white - 100)
     panes = {SOUTH: [Opening(x, 1.5, top_m=2.4, bottom_m=1.0) for x in (1.75, 5.0)]}
     panes[NORTH] = [Opening(HALL.length_m - 9.3, 1.6, top_m=2.4, bottom_m=1.0)]
-    outer_walls(build, HALL, (plain, tinted, striped, plain), windows=panes, trim=trim, power=_WINDOW_POWER)
+    panes[SOUTH].append(_DARK_DOOR)
+    outer_walls(build, HALL, (plain, tinted, striped, plain), openings=panes, trim=trim, power=_WINDOW_POWER)
     passages = [Opening(0.9, 1.2), Opening(6.9, 1.2)]
     wall(build, *_DIVIDER, height_m=HALL.height_m, openings=passages, left=plain, right=plain, trim=trim)
     way = [Opening(2.75, 1.2)]
@@ -193,8 +201,7 @@ def _door(build: Builder, place: Pose) -> None:
 
 def _corridor(build: Builder, rng: np.random.Generator, look: Ware) -> None:
     """Add coats, an emergency shower, closed doors, notices and signs."""
-    for x in (8.0, 10.8):
-        _door(build, HALL.on(SOUTH, x))
+    _door(build, HALL.on(SOUTH, 10.8))
     _print(build, rng, HALL.on(SOUTH, 9.25), (1.0, 0.75), image=cork(rng, px((1.0, 0.75))), name="notices")
     _print(build, rng, HALL.on(SOUTH, 7.3), (0.34, 0.46), image=prints.hazards(rng, px((0.34, 0.46))), name="sign")
     size = (1.1, 0.8)
@@ -207,7 +214,8 @@ def _corridor(build: Builder, rng: np.random.Generator, look: Ware) -> None:
     furniture.clutter(build, rng, look, moved(low, 0.0, 0.22, 1.0), width_m=0.8, count=2)
     _print(build, rng, low, (0.6, 0.75), image=textures.page(rng, px((0.6, 0.75))), up_m=1.75)
     furniture.shower(build, look, HALL.on(SOUTH, 10.03))
-    for x, y, yaw in ((7.75, 0.9, np.pi / 2), (9.1, 7.0, 0.0)):
+    spots = ((7.75, 0.9, np.pi / 2), (9.1, 7.0, 0.0), (3.65, 3.9, 0.0), (1.4, 1.2, np.pi / 2), (5.9, 1.0, np.pi / 2))
+    for x, y, yaw in (*spots, (5.9, 6.6, 0.0), (10.3, 4.2, 0.0), (8.0, 4.9, np.pi / 2)):
         _hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw))
 
 
@@ -222,3 +230,14 @@ def _hanging_sign(build: Builder, rng: np.random.Generator, place: Pose) -> None
         build.box(place, [0.0, 0.0, up], [size[0] + 0.02, 0.02, size[1] + 0.02], rim, solid=False)
         for yaw in (0.0, np.pi):
             build.panel(upright(moved(place, yaw_rad=yaw), 0.0, 0.012, up), size, image, solid=False)
+
+
+def _dark_room(build: Builder, rng: np.random.Generator, look: Ware) -> None:
+    """Add the dark room off the corridor: bare walls, two plain cabinets, little light."""
+    white = build.texture(blank(rng, (3.0, HALL.height_m), base=(204, 204, 200)))
+    ground = build.texture(prints.vinyl(rng, (336, 336), base=(140, 144, 146), px_per_m=_FLOOR_PX_PER_M))
+    above = build.texture(ceiling_grid((2.4, 2.4), base=(230, 230, 226), step_m=0.6))
+    side_room(build, _DARK, Finish(white, ground, above, build.plain((120, 120, 118))), lamp_power=1.5)
+    x0, y0, _, _ = _DARK.rect
+    for y in (y0 + 0.47, y0 + 1.38):
+        furniture.cabinet(build, look, yaw_pose([x0, y, 0.0], -np.pi / 2))

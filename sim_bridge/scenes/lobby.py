@@ -1,15 +1,15 @@
-"""The lobby: a high hall with a glazed front, a reception, pillars, gates before the lifts, and a waiting room.
+"""The lobby: a high hall with a glazed front, a reception, pillars, gates before the lifts, two side rooms.
 
 The plan, in metres, with x to the east (0..12.4) and y to the north (0..9):
 
-    +----------------+-- lift --- lift --- lift --+   9.0
-    | waiting room   |                            |
-    +---------   ----+ o  gate gate gate gate gate|   6.3
-    |                                             |
-    | counter  o    sofas                display  |
-    |   |           sofas    o                    |
-    |                              sofa  table  sofa
-    +-------------   glazed front   --------------+   0
+             +----------------+-- lift --- lift --- lift --+   9.0
+             | waiting room   |                            |
+    +--------+---------   ----+ o  gate gate gate gate gate|   6.3
+    | cloak- |                                             |
+    |  room  | counter  o    sofas                display  |
+    +--------+   |           sofas    o                    |
+             |                              sofa  table  sofa
+             +-------------   glazed front   --------------+   0
 """
 
 from __future__ import annotations
@@ -28,9 +28,11 @@ from sim_bridge.scenes import lobby_furniture as furniture
 from sim_bridge.scenes import lobby_prints as prints
 from sim_bridge.scenes import office_prints, textures
 from sim_bridge.scenes.blueprint import Blueprint, Builder
+from sim_bridge.scenes.halls import EAST
 from sim_bridge.scenes.lobby_furniture import Make
 from sim_bridge.scenes.office_furniture import gallery, hang, moved, plant, px
 from sim_bridge.scenes.plan import Opening, on_wall, outside, slab, wall, wall_frame, window
+from sim_bridge.scenes.side_rooms import Finish, SideRoom, side_room, union
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 12.4, 9.0, 3.9
 WAITING_X, GATES_Y = 4.4, 6.3
@@ -46,6 +48,8 @@ _NORTH = ((LENGTH_M, WIDTH_M), (0.0, WIDTH_M))
 _WEST = ((0.0, WIDTH_M), (0.0, 0.0))
 _WAITING_SOUTH = ((0.0, GATES_Y), (WAITING_X, GATES_Y))
 _WAITING_EAST = ((WAITING_X, GATES_Y), (WAITING_X, WIDTH_M))
+_CLOAKS = SideRoom((-3.4, 3.1, -0.06, 6.1), EAST, ((-1.35, 4.2), (-1.35, 6.1)), 2.6)
+_CLOAKS_DOOR = Opening(WIDTH_M - 5.5, 1.1)
 _PILLARS = ((3.3, 3.1), (8.3, 3.6), (5.45, GATES_Y))
 
 
@@ -54,7 +58,7 @@ _GALLERIES: tuple[tuple[Line, Literal["left", "right"], float, tuple[tuple[float
     (_SOUTH, "left", 1.5, ((0.2, 1.4), (2.4, 3.25), (9.4, 12.1))),
     (_EAST, "left", 1.65, ((0.4, 3.7), (6.0, 8.8))),
     (_NORTH, "left", 1.75, ((2.8, 3.2), (4.75, 5.2), (9.3, 10.0))),
-    (_WEST, "left", 1.5, ((2.9, 4.2), (6.6, 8.7))),
+    (_WEST, "left", 1.5, ((6.6, 8.7),)),
     (_WAITING_EAST, "left", 1.5, ((0.2, 1.9),)),
     (_WAITING_EAST, "right", 1.5, ((0.3, 2.5),)),
     (_WAITING_SOUTH, "left", 1.5, ((1.0, 2.5),)),
@@ -76,8 +80,10 @@ def lobby(seed: int) -> Blueprint:
     _boards(build, rng, look)
     _waiting_room(build, rng, look)
     _galleries(build, rng)
-    bounds = (0.0, 0.0, LENGTH_M, WIDTH_M)
-    outside(build, bounds, [bounds])
+    _cloakroom(build, rng)
+    hall = (0.0, 0.0, LENGTH_M, WIDTH_M)
+    bounds = union(hall, _CLOAKS.floor)
+    outside(build, bounds, [hall, _CLOAKS.floor])
     return build.blueprint(floor_bounds=bounds)
 
 
@@ -103,7 +109,7 @@ def _walls(build: Builder, rng: np.random.Generator) -> None:
     trim = build.plain(white - 110)
     panes = [Opening(s, 1.9, top_m=2.9, bottom_m=0.12) for s in (4.3, 6.3, 8.3)]
     sides = [_Side(_SOUTH, plain, None, panes), _Side(_EAST, striped, None), _Side(_NORTH, clad, None)]
-    sides += [_Side(_WEST, plain, None), _Side(_WAITING_EAST, plain, clad)]
+    sides += [_Side(_WEST, plain, plain, [_CLOAKS_DOOR]), _Side(_WAITING_EAST, plain, clad)]
     for side in (*sides, _Side(_WAITING_SOUTH, plain, slatted, [Opening(3.3, 1.25)])):
         wall(build, *side.line, height_m=HEIGHT_M, openings=side.openings, left=side.left, right=side.right, trim=trim)
     view, rim = build.texture(prints.street(rng, (160, 128))), build.plain((74, 78, 84))
@@ -237,3 +243,13 @@ def _waiting_room(build: Builder, rng: np.random.Generator, look: Make) -> None:
     size = (1.1, 0.75)
     _hang(build, _WEST, WIDTH_M - 7.4, size, office_prints.cork(rng, px(size)), up_m=1.5, name="notices")
     furniture.kiosk(build, rng, look, yaw_pose([3.4, 8.5, 0.0], np.pi + 0.2))
+
+
+def _cloakroom(build: Builder, rng: np.random.Generator) -> None:
+    """Add the cloakroom behind the reception: bare walls, lockers of which each looks like the other."""
+    white = build.texture(office_prints.paint(rng, (286, 330), base=(218, 216, 210)))
+    grey = build.texture(prints.terrazzo(rng, (312, 312), base=(150, 148, 144), px_per_m=_FLOOR_PX_PER_M))
+    above = build.texture(office_prints.ceiling_tiles(rng, (288, 288), px_per_m=120))
+    side_room(build, _CLOAKS, Finish(white, grey, above, build.plain((110, 110, 106))), lamp_power=_LAMP_POWER)
+    x0, _, _, y1 = _CLOAKS.rect
+    furniture.lockers(build, yaw_pose([x0 + 0.95, y1, 0.0], np.pi), columns=4)

@@ -196,7 +196,7 @@ def _galleries(build: Builder, rng: np.random.Generator) -> None:
         (WEST.left, 1.55, ((0.55, 3.1), (5.0, 7.2), (9.0, 10.4))),
         (KITCHEN.left, 1.5, ((2.0, 4.6),)),
         (KITCHEN.right, 1.5, ((0.4, 3.2),)),
-        (FRONT.left, 1.45, ((0.2, 1.3), (2.9, 8.5), (10.1, 11.65), (13.15, 14.7))),
+        (FRONT.left, 1.45, ((2.9, 6.6), (11.0, 11.65), (13.15, 14.7))),
         (FRONT.right, 1.5, ((7.8, 8.5), (10.1, 11.2), (13.1, 14.7))),
         (BACK.right, 1.45, ((2.12, 2.7), (5.8, 6.85), (8.5, 9.3), (10.95, 12.5), (13.7, 14.7))),
         (BACK.left, 1.45, ((1.95, 4.1), (4.7, 7.1), (10.8, 14.4))),
@@ -243,7 +243,8 @@ def _open_plan(build: Builder, rng: np.random.Generator, look: Style) -> None:
     size = (1.1, 0.62)
     image = textures.screen(rng, px(size))
     hang(build, on_wall(KITCHEN.left(1.3), 0.0, 1.5, off_m=0.03), size, image, name="television")
-    for x, y, yaw in ((3.97, 1.6, 0.0), (7.4, 4.0, 0.0), (2.1, 5.4, np.pi / 2), (10.6, 3.4, np.pi / 2)):
+    spots = ((3.97, 1.6, 0.0), (7.4, 4.0, 0.0), (2.1, 5.4, np.pi / 2), (10.6, 3.4, np.pi / 2))
+    for x, y, yaw in (*spots, (0.8, 3.0, 0.0), (5.7, 0.9, 0.0), (7.6, 1.2, np.pi / 2), (9.15, 5.5, np.pi / 2)):
         furniture.hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw), ceiling_m=HEIGHT_M)
     for x, y in ((10.95, 0.5), (0.5, 5.7)):
         furniture.plant(build, rng, yaw_pose([x, y, 0.0], float(rng.uniform(0, np.pi))))
@@ -260,7 +261,7 @@ def _corridor(build: Builder, rng: np.random.Generator, look: Style) -> None:
         image = prints.sign(rng, px(size), text=text, base=(70, 78, 90))
         hang(build, on_wall(BACK.right(x), 0.0, 1.55, off_m=0.0), size, image, name="sign")
     _board(build, rng, WEST.left(WIDTH_M - 6.95), width_m=1.2)
-    for x in (3.2, 8.6):
+    for x in (1.0, 3.2, 5.9, 8.6, 11.9):
         furniture.hanging_sign(build, rng, yaw_pose([x, 6.95, 0.0], np.pi / 2), ceiling_m=HEIGHT_M)
 
 

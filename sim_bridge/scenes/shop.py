@@ -1,4 +1,4 @@
-"""The shop: aisles between rows of equal shelf units, fridges, checkouts, fruit, promotional signs, a cold store.
+"""The shop: aisles between rows of equal shelf units, fridges, checkouts, fruit, promotional signs, a stock room.
 
 The plan, in metres, with x to the east (0..12) and y to the north (0..10):
 
@@ -8,8 +8,9 @@ The plan, in metres, with x to the east (0..12) and y to the north (0..10):
     |w   ||    ||    ||    ||        +------+   o  checkouts
     |w   ||    ||    ||    ||              e|   e  shelves along the east wall
     |w   ==    ==    ==    ==              e|   =  a unit across the end, under a sign of its own
-    |    fruit  bins  pallets    o    o     |
-    +-----window-----window--------door-----+
+    |    fruit  bins  pallets    o    o     +------+
+    |                            o    o       stock|
+    +-----window-----window--------door-----+------+
 """
 
 from __future__ import annotations
@@ -25,14 +26,17 @@ from sim_bridge.scenes import shop_pictures as pictures
 from sim_bridge.scenes.blueprint import Blueprint, Builder
 from sim_bridge.scenes.forms import moved, paint
 from sim_bridge.scenes.halls import EAST, NORTH, SOUTH, WEST, Hall, lamps, outer_walls
-from sim_bridge.scenes.plan import Opening, slab
+from sim_bridge.scenes.plan import THICKNESS_M, Opening, outside, slab
 from sim_bridge.scenes.shop_pictures import Product
+from sim_bridge.scenes.side_rooms import Finish, SideRoom, side_room, union
 from sim_bridge.scenes.textures import Rgb, to_bytes
 
 _HALL = Hall(12.0, 10.0, 3.4)
 _BANDS = [(0.0, 0.25, (120, 124, 120)), (2.35, 2.5, (76, 128, 96)), (2.56, 2.6, (76, 128, 96))]
 _ROWS_X = (2.25, 4.55, 6.85, 9.15)
 _ROW_START_M = 3.85
+_STOCK = SideRoom((_HALL.length_m + THICKNESS_M, 0.6, 15.7, 3.5), WEST, ((13.46, 1.7), (13.46, 3.5)), 2.8)
+_STOCK_DOOR = Opening(2.85, 1.1)
 _WINDOWS = (Opening(1.6, 1.8, 2.5, 0.9), Opening(4.6, 1.8, 2.5, 0.9))
 
 
@@ -48,7 +52,10 @@ def shop(seed: int) -> Blueprint:
     _fridges(build, rng, articles)
     _front(build, rng, articles)
     _signs(build, rng)
-    return build.blueprint(floor_bounds=_HALL.bounds)
+    _stock_room(build, rng, articles)
+    bounds = union(_HALL.bounds, _STOCK.floor)
+    outside(build, bounds, [_HALL.bounds, _STOCK.floor])
+    return build.blueprint(floor_bounds=bounds)
 
 
 def _shell(build: Builder, rng: np.random.Generator) -> None:
@@ -62,10 +69,9 @@ def _shell(build: Builder, rng: np.random.Generator) -> None:
         face = (_HALL.side_m(side), _HALL.height_m)
         tone = np.array([206, 204, 196]) + rng.normal(0, 3, 3)
         faces.append(build.texture(prints.banded(prints.blank(rng, face, base=tone), face, _BANDS)))
-    outer_walls(
-        build, _HALL, faces, windows={SOUTH: _WINDOWS}, trim=None, power=1.1, view=build.texture(_street(rng)),
-        cell_m=0.2,
-    )  # fmt: skip
+    openings = {SOUTH: _WINDOWS, EAST: (_STOCK_DOOR,)}
+    street = build.texture(_street(rng))
+    outer_walls(build, _HALL, faces, openings=openings, trim=None, power=1.1, view=street, cell_m=0.2)
     spots = [(x, y) for x in (1.1, 3.4, 5.7, 8.0, 10.6) for y in (1.6, 5.0, 8.4)]
     lamps(build, spots, z_m=3.1, size_m=(0.16, 1.6), power=1.9, housing=paint(build, (150, 150, 152)))
 
@@ -164,7 +170,7 @@ def _signs(build: Builder, rng: np.random.Generator) -> None:
 def _poster_places(rng: np.random.Generator) -> list[tuple[Pose, tuple[float, float], float]]:
     """Return wall frames, sizes and heights of the posters: in clusters, a good part of the walls stays blank."""
     places: list[tuple[Pose, tuple[float, float], float]] = []
-    for side, at in ((WEST, 8.6), (SOUTH, 8.85), (SOUTH, 11.0), (EAST, 2.7), (NORTH, 2.6)):
+    for side, at in ((WEST, 8.6), (SOUTH, 8.85), (SOUTH, 11.0), (EAST, 1.3), (NORTH, 2.6)):
         size = (float(rng.uniform(0.6, 0.9)), float(rng.uniform(0.7, 1.1)))
         places.append((_HALL.on(side, at), size, 1.55))
     # Banners above the shelves and fridges, for whoever looks up.
@@ -176,3 +182,15 @@ def _poster_places(rng: np.random.Generator) -> list[tuple[Pose, tuple[float, fl
         end = yaw_pose([x, _ROW_START_M + 4.03, 0.0], 0.0)
         places.append((end, (float(rng.uniform(0.5, 0.7)), float(rng.uniform(0.7, 0.9))), 0.95))
     return places
+
+
+def _stock_room(build: Builder, rng: np.random.Generator, articles: list[Product]) -> None:
+    """Add the stock room: bare walls, pallets of one article."""
+    white = build.texture(prints.blank(rng, (3.0, _STOCK.height_m), base=(200, 198, 192)))
+    ground = build.texture(prints.tiled(rng, (2.4, 2.4), tile_m=0.4, base=(150, 148, 144), joint=(132, 130, 126)))
+    above = build.texture(prints.ceiling_grid((2.4, 2.4), base=(214, 214, 212), step_m=0.6))
+    side_room(build, _STOCK, Finish(white, ground, above, build.plain((110, 110, 108))), lamp_power=1.9)
+    _, _, x1, y1 = _STOCK.rect
+    article = articles[int(rng.integers(len(articles)))]
+    for y in (y1 - 0.45, y1 - 1.15):
+        furniture.pallet_of_goods(build, yaw_pose([x1 - 0.45, y, 0.0], rng.normal(0, 0.03)), article, layers=4)

@@ -1,10 +1,10 @@
-"""The workshop: one high hall with workbenches, machine tools, racks, pallets, a roller door, and a planning office.
+"""The workshop: one high hall with benches, machine tools, racks, pallets, a roller door, a planning office, a store.
 
 The plan, in metres, with x to the east (0..10.2) and y to the north (0..8):
 
-    +-- bench -- bench -- bench -- bench --+   8.0
-    |                                      |
-    | d   mill   lathe    screen           r
+    +-- bench -- bench -- bench -- bench --+------+ 8.0
+    |                                        store|
+    | d   mill   lathe    screen           r------+
     | d   mill   lathe    pallets          o
     |                                      l
     +-------+    pallets    drums          l
@@ -27,14 +27,17 @@ from sim_bridge.scenes.blueprint import Blueprint, Builder
 from sim_bridge.scenes.forms import hang, moved, paint, upright
 from sim_bridge.scenes.halls import EAST, NORTH, SOUTH, WEST, Hall, lamps, outer_walls
 from sim_bridge.scenes.office_prints import cork
-from sim_bridge.scenes.plan import Opening, outside, slab, wall, wall_frame
+from sim_bridge.scenes.plan import THICKNESS_M, Opening, outside, slab, wall, wall_frame
 from sim_bridge.scenes.prints import banded, blank, ceiling_grid
+from sim_bridge.scenes.side_rooms import Finish, SideRoom, side_room, union
 from sim_bridge.scenes.workshop_furniture import Gear, px
 
 HALL = Hall(10.2, 8.0, 3.9)
 OFFICE_M = (2.6, 2.6)
 _FLOOR_PX_PER_M = 140
 _WINDOW_POWER, _LAMP_POWER = 1.6, 5.5
+_STORE = SideRoom((HALL.length_m + THICKNESS_M, 5.0, 13.5, 7.9), WEST, ((11.66, 5.0), (11.66, 6.8)), HALL.height_m)
+_STORE_DOOR = Opening(6.1, 1.1)
 _OFFICE_EAST = ((OFFICE_M[0], 0.0), OFFICE_M)
 _OFFICE_NORTH = ((0.0, OFFICE_M[1]), OFFICE_M)
 
@@ -51,8 +54,10 @@ def workshop(seed: int) -> Blueprint:
     _stores(build, rng, look)
     _gate(build, rng, look)
     _office(build, rng, look)
-    outside(build, HALL.bounds, [HALL.bounds])
-    return build.blueprint(floor_bounds=HALL.bounds)
+    _store(build, rng)
+    bounds = union(HALL.bounds, _STORE.floor)
+    outside(build, bounds, [HALL.bounds, _STORE.floor])
+    return build.blueprint(floor_bounds=bounds)
 
 
 def _walls(build: Builder, rng: np.random.Generator) -> None:
@@ -65,7 +70,8 @@ def _walls(build: Builder, rng: np.random.Generator) -> None:
     trim = build.plain(np.asarray(tone) - 50)
     high = {SOUTH: [Opening(x, 1.9, top_m=3.5, bottom_m=2.5) for x in (4.2, 6.5, 8.8)]}
     high[WEST] = [Opening(HALL.width_m - y, 1.7, top_m=3.5, bottom_m=2.5) for y in (4.1, 6.4)]
-    outer_walls(build, HALL, faces, windows=high, trim=trim, power=_WINDOW_POWER)
+    high[EAST] = [_STORE_DOOR]
+    outer_walls(build, HALL, faces, openings=high, trim=trim, power=_WINDOW_POWER)
     plain = build.texture(blank(rng, (2.6, HALL.height_m), base=white - 8))
     look_in = [Opening(1.3, 1.2, top_m=1.9, bottom_m=1.05)]
     wall(
@@ -169,11 +175,11 @@ def _gate(build: Builder, rng: np.random.Generator, look: Gear) -> None:
         rail = build.shared("rail", lambda: prints.hazard_stripes((480, 24), pitch_px=48.0))
         for x in (-wide / 2 - 0.06, wide / 2 + 0.06):
             build.box(place, [x, 0.05, high / 2], [0.12, 0.1, high - 0.002], look.dark, front=rail)
-    for at, size in ((1.2, (0.9, 1.2)), (6.1, (0.95, 1.2)), (7.4, (0.8, 0.6))):
+    for at, size in ((1.2, (0.9, 1.2)), (7.3, (0.95, 1.2))):
         _print(build, rng, HALL.on(EAST, at), size, up_m=1.5)
     size = (0.75, 0.55)
     _print(build, rng, moved(place, y_m=0.04), size, image=prints.warning(rng, px(size)), up_m=1.35, name="sign")
-    for x, y, yaw in ((3.7, 3.65, np.pi / 2),):
+    for x, y, yaw in ((3.7, 3.65, np.pi / 2), (6.6, 2.4, 0.0), (8.6, 5.6, np.pi / 2)):
         _hanging_sign(build, rng, yaw_pose([x, y, 0.0], yaw))
 
 
@@ -208,3 +214,14 @@ def _hanging_sign(build: Builder, rng: np.random.Generator, place: Pose) -> None
         build.box(place, [0.0, 0.0, up], [size[0] + 0.02, 0.02, size[1] + 0.02], rim, solid=False)
         for yaw in (0.0, np.pi):
             build.panel(upright(moved(place, yaw_rad=yaw), 0.0, 0.012, up), size, image, solid=False)
+
+
+def _store(build: Builder, rng: np.random.Generator) -> None:
+    """Add the store beside the roller door: bare walls and a few drums."""
+    white = build.texture(blank(rng, (3.0, HALL.height_m), base=(206, 204, 198)))
+    ground = build.texture(prints.concrete(rng, (336, 336), base=(136, 136, 132), px_per_m=_FLOOR_PX_PER_M))
+    above = build.texture(ceiling_grid((2.0, 2.0), base=(196, 196, 190), step_m=1.0))
+    side_room(build, _STORE, Finish(white, ground, above, build.plain((100, 100, 98))), lamp_power=_LAMP_POWER)
+    _, y0, x1, _ = _STORE.rect
+    for x, y in ((x1 - 0.32, y0 + 0.32), (x1 - 0.95, y0 + 0.32), (x1 - 0.32, y0 + 0.95)):
+        furniture.drum(build, rng, yaw_pose([x, y, 0.0], float(rng.uniform(0.5, 2.2))))

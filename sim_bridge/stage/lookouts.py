@@ -20,6 +20,9 @@ from sim_bridge.stage.tours import largest_part, round_trip
 
 Array = NDArray[np.float64]
 
+# Two places at least so far apart are two.
+LEAST_APART_M = 0.2
+
 
 @dataclasses.dataclass(frozen=True)
 class LookoutOptions:
@@ -68,12 +71,20 @@ def find_lookouts(scene: Scene, options: LookoutOptions, *, rng: np.random.Gener
         found = _free_place(scene, graph, cells, options, rng=rng)
         if found is not None:
             places.append(found)
-    if len(places) < options.count:
-        raise SynthesisError(
-            f"the scene has room for {len(places)} of {options.count} waypoints: elsewhere the arm would touch "
-            "furniture",
-            hint="ask for fewer waypoints",
-        )
+    # Where the arm finds no room in a region, another one has one more.
+    while len(places) < options.count:
+        found = None
+        if places:
+            far, _ = cKDTree(graph.centres[[place.cell for place in places]]).query(graph.centres[roomy])
+            farthest_first = np.argsort(-far, kind="stable")[: int(np.count_nonzero(far > LEAST_APART_M))]
+            found = _free_place(scene, graph, roomy[farthest_first], options, rng=rng)
+        if found is None:
+            raise SynthesisError(
+                f"the scene has room for {len(places)} of {options.count} waypoints: elsewhere the arm would touch "
+                "furniture",
+                hint="ask for fewer waypoints",
+            )
+        places.append(found)
     return _toured(graph, places, options)
 
 

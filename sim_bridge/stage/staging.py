@@ -191,7 +191,8 @@ def _place_start(scene: Scene, options: StageOptions, *, rng: np.random.Generato
             break
     if best is None:
         raise SynthesisError(
-            "the scene has no bare wall in front of which the robot can stand", hint="use another seed"
+            "the scene has no bare wall in front of which the robot can stand",
+            hint="use another seed, or in a mesh of your own give it more bare wall",
         )
     return best[1], best[2]
 
