@@ -15,6 +15,7 @@ from rich.table import Table
 from tyro.conf import Positional
 from tyro.conf import UseAppendAction as Repeated
 
+from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
@@ -331,7 +332,13 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 }
 GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
     "map": {"build": map_build, "info": map_info, "compact": map_compact},
-    "tags": {"sheet": tags_sheet, "calibrate": tags_calibrate, "import": tags_import, "export": tags_export},
+    "tags": {
+        "sheet": tags_sheet,
+        "calibrate": tags_calibrate,
+        "check": tags_check,
+        "import": tags_import,
+        "export": tags_export,
+    },
 }
 
 
