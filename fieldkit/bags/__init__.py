@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fieldkit.bags.arm import ArmRecording, Kinematics, open_arm
 from fieldkit.bags.detections import RecordedTag, RecordedTags, read_detections
 from fieldkit.bags.inspecting import inspect_recording
 from fieldkit.bags.layouts import LAYOUTS, Layout
@@ -11,13 +12,16 @@ from fieldkit.bags.writing import BagFormat, RecordingWriter
 
 __all__ = [
     "LAYOUTS",
+    "ArmRecording",
     "BagFormat",
+    "Kinematics",
     "Layout",
     "RecordedTag",
     "RecordedTags",
     "RecordingWriter",
     "TfBuffer",
     "inspect_recording",
+    "open_arm",
     "open_recording",
     "read_detections",
 ]

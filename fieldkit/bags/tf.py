@@ -99,6 +99,19 @@ class TfBuffer:
                 found[index] = errors[place] if place in errors else poses[place]
         return [found[index] for index in range(len(t_ns))]
 
+    def chain(self, target: str, source: str, *, t_ns: int) -> tuple[tuple[str, str, bool], ...]:
+        """Return the steps from target to source as (frame, next frame, whether the step between them can move).
+
+        target_from_source is the product of frame_from_next over all steps. Raises FrameError where they are not
+        connected.
+        """
+        down, up = self._way(clean_frame(target), clean_frame(source), t_ns)
+        frames = (*down, *reversed(up[:-1]))
+        return tuple(
+            (a, b, any(a in self._moving.get(c, {}) or b in self._moving.get(c, {}) for c in (a, b)))
+            for a, b in itertools.pairwise(frames)
+        )
+
     def _way(self, target: str, source: str, t_ns: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the frames from target, and from source, up to the first that they have in common."""
         up_source, up_target = self._ancestors(source, t_ns), self._ancestors(target, t_ns)
