@@ -10,11 +10,11 @@ from rich.console import Console
 from tyro.conf import Positional
 from tyro.conf import UseAppendAction as Repeated
 
-from fieldkit.console import cells, make_table, print_json
+from fieldkit.console import ProgressBars, cells, make_table, print_json
 from fieldkit.errors import TagError
 
 if TYPE_CHECKING:
-    from fieldkit.checks import DistanceCheck, ScaleCheck
+    from fieldkit.checks import ArmCheck, DistanceCheck, ScaleCheck
     from fieldkit.types import TagMap
 
 # Heavy rooms are imported inside the commands, as in fieldkit.cli
@@ -27,27 +27,157 @@ def tags_check(
     *,
     distance: Repeated[tuple[tuple[str, str, float], ...]] = (),
     tape_sigma_m: float = 0.002,
+    recording: Path | None = None,
+    layout: str | None = None,
+    size_m: Repeated[tuple[str, ...]] = (),
+    sigmas: float = 3.0,
+    refine_camera: Path | None = None,
+    refine_hand: Path | None = None,
     json: bool = False,
+    force: bool = False,
 ) -> int:
-    """Check tags with a tape measure; exit with 3 when a check fails.
+    """Check tags with a tape measure, or camera, hand and stamps with the tags; exit with 3 when a check fails.
 
     Args:
         tags: tags.toml
         distance: two tags (3, or 3@w02 for its place at a visit) and the metres between their centres; may be repeated
         tape_sigma_m: standard deviation of the tape measure in m
+        recording: bag or session folder in which the arm camera sees tags from many poses while the robot stands
+        layout: names of topics and frames of the recording; found by itself when not given
+        size_m: edge length in m of tags that tags.toml lacks, or ID:SIZE for one tag; may be repeated
+        sigmas: a deviation from what is stated counts from so many standard deviations
+        refine_camera: camera.toml to write: the arm camera as the recording shows it
+        refine_hand: hand.toml to write: the camera in the hand as the recording shows it
         json: print JSON
+        force: replace existing files
     """
     from fieldkit import store
 
+    outputs = [path for path in (refine_camera, refine_hand) if path is not None]
+    for path in outputs:
+        store.refuse_existing(path, force=force, kind="file")
     loaded = store.read_tags(tags)
-    if not distance:
-        raise TagError(f"{tags}: nothing to check; expected --distance A B METRES", hint="measure between two tags")
-    checks, scale = _distances(loaded, distance, tape_sigma_m=tape_sigma_m)
+    if recording is None and (outputs or not distance):
+        raise TagError(
+            f"{tags}: nothing to check{' with' if outputs else ''}; expected --distance A B METRES or --recording",
+            hint="measure between two tags, or record a sweep of the arm over one",
+        )
+    report: dict[str, Any] = {"version": 1}
+    verdicts: list[str] = []
+    if distance:
+        checks, scale = _distances(loaded, distance, tape_sigma_m=tape_sigma_m)
+        report |= _distances_json(checks, scale)
+        verdicts += [scale.verdict, *(c.verdict for c in checks)]
+        if not json:
+            _print_distances(checks, scale)
+    if recording is not None:
+        found = _check_arm(loaded, recording, layout=layout, sizes=size_m, sigmas=sigmas)
+        report["arm"] = _arm_json(found)
+        verdicts.append(found.verdict)
+        if not json:
+            _print_arm(found)
+        _refine(found, camera=refine_camera, hand=refine_hand)
     if json:
-        print_json({"version": 1, **_distances_json(checks, scale)})
-    else:
-        _print_distances(checks, scale)
-    return 3 if "fail" in (scale.verdict, *(c.verdict for c in checks)) else 0
+        print_json(report)
+    return 3 if "fail" in verdicts else 0
+
+
+def _check_arm(tags: TagMap, recording: Path, *, layout: str | None, sizes: tuple[str, ...], sigmas: float) -> ArmCheck:
+    from fieldkit.bags import open_arm
+    from fieldkit.calibrate import parse_sizes
+    from fieldkit.checks import check_arm, find_sweep
+
+    sizes_m: dict[int | None, float] = {t.id: t.size_m for t in tags.tags}
+    sizes_m |= parse_sizes(sizes) if sizes else {}
+    opened = open_arm(recording, layout=layout)
+    for warning in opened.warnings:
+        _log.warning("%s: %s", recording, warning)
+    with ProgressBars() as progress:
+        families = tuple(dict.fromkeys(t.family for t in tags.tags)) or ("tag36h11",)
+        sweep = find_sweep(opened, sizes_m, families=families, progress=progress)
+    for why, count in sweep.left_out.items():
+        _log.info("%s: left out %d images or sightings %s", recording, count, why)
+    return check_arm(sweep, sigmas=sigmas)
+
+
+def _refine(found: ArmCheck, *, camera: Path | None, hand: Path | None) -> None:
+    """Write what is to be refined; both are fitted before either is written."""
+    from fieldkit import store
+    from fieldkit.checks import refine_arm
+
+    cameras = None if camera is None else refine_arm(found, what="camera")
+    hands = None if hand is None else refine_arm(found, what="hand")
+    refined = cameras or hands
+    if refined is not None and refined.kept:
+        _log.warning("%s: not shown, as stated: %s", found.sweep.path, ", ".join(refined.kept))
+    if camera is not None and cameras is not None:
+        store.write_camera(camera, cameras.camera, rms_px=cameras.rms_px)
+        _log.info("wrote %s", camera)
+    if hand is not None and hands is not None and hands.hand_from_cam is not None:
+        kinematics = found.sweep.kinematics
+        assert kinematics.mount is not None
+        mount = store.Hand(kinematics.mount[0], kinematics.camera_frame, hands.hand_from_cam, hands.covariance)
+        store.write_hand(hand, mount)
+        _log.info("wrote %s", hand)
+    for group, given in (("camera", camera), ("hand", hand)):
+        off = [f.name for f in found.findings if f.group == group and f.verdict in ("warn", "fail")]
+        if refined is not None and given is None and off:
+            _log.warning(
+                "%s: %s differs too (%s): what was refined belongs to a refined %s; give --refine-%s, too",
+                found.sweep.path, group, ", ".join(off), group, group,
+            )  # fmt: skip
+
+
+def _print_arm(found: ArmCheck) -> None:
+    fit, sweep = found.fit, found.sweep
+    title = (
+        f"{sweep.path}: {int(fit.used.sum())} of {len(sweep)} sightings in {len(sweep.stands)} stands; residuals "
+        f"{fit.rms_px[0]:.2f} px as stated, {fit.rms_px[1]:.2f} px as found"
+    )
+    table = make_table("what", "deviation", "sigma", "sigmas", "matters from", "unit", "verdict", title=title)
+    for f in found.findings:
+        digits = "{:+.4f}" if not f.unit else "{:+.2f}"
+        numbers = [digits.format(f.deviation), digits.format(f.sigma)[1:], f"{f.sigmas:+.1f}", f"{f.tolerance:.3g}"]
+        verdict = "not observed" if f.verdict == "unknown" else f.verdict
+        table.add_row(
+            *cells([f.name, *(["-"] * 3 if f.verdict == "unknown" else numbers[:3]), numbers[3], f.unit, verdict])
+        )
+    console = Console(width=max(120, Console().width))
+    console.print(table)
+    noise = fit.noise
+    words = (
+        f"arm {noise.arm:g} times 0.2 deg and 2 mm, time {1e3 * noise.jitter_s:g} ms, blur {1e3 * noise.blur_s:g} ms"
+    )
+    console.print(f"noise shown: {words}; verdict: {found.verdict}", markup=False)
+
+
+def _arm_json(found: ArmCheck) -> dict[str, Any]:
+    fit, kinematics = found.fit, found.sweep.kinematics
+    rows = [
+        {
+            "name": f.name,
+            "of": f.group,
+            "unit": f.unit,
+            "deviation": f.deviation,
+            "sigma": f.sigma,
+            "sigmas": f.sigmas,
+            "tolerance": f.tolerance,
+            "verdict": f.verdict,
+        }
+        for f in found.findings
+    ]
+    return {
+        "recording": found.sweep.path,
+        "verdict": found.verdict,
+        "n_sightings": len(found.sweep),
+        "n_used": int(fit.used.sum()),
+        "n_stands": len(found.sweep.stands),
+        "rms_px": {"stated": fit.rms_px[0], "found": fit.rms_px[1]},
+        "noise": {"arm": fit.noise.arm, "jitter_s": fit.noise.jitter_s, "blur_s": fit.noise.blur_s},
+        "frames": {"body": kinematics.body_frame, "camera": kinematics.camera_frame},
+        "left_out": dict(found.sweep.left_out),
+        "findings": rows,
+    }
 
 
 def _distances(

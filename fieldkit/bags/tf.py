@@ -112,6 +112,12 @@ class TfBuffer:
             for a, b in itertools.pairwise(frames)
         )
 
+    def interval_ns(self, a: str, b: str) -> int:
+        """Return the median time between two samples of the transform between two neighbouring frames."""
+        tracks = [self._moving.get(child, {}).get(parent) for parent, child in ((a, b), (b, a))]
+        stamps = [t.ordered()[0] for t in tracks if t is not None]
+        return int(np.median(np.diff(stamps[0]))) if stamps and len(stamps[0]) > 1 else 0
+
     def _way(self, target: str, source: str, t_ns: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the frames from target, and from source, up to the first that they have in common."""
         up_source, up_target = self._ancestors(source, t_ns), self._ancestors(target, t_ns)

@@ -1,5 +1,6 @@
 """Checks with what a lab has: a tape measure between tags, and an arm that sweeps its camera over them."""
 
+from fieldkit.checks.arm import ArmCheck, Finding, Refined, check_arm, late_ms, refine_arm
 from fieldkit.checks.distances import (
     TAPE_SIGMA_M,
     DistanceCheck,
@@ -9,5 +10,22 @@ from fieldkit.checks.distances import (
     check_distances,
     parse_tag,
 )
+from fieldkit.checks.sweeps import Sweep, find_sweep
 
-__all__ = ["TAPE_SIGMA_M", "DistanceCheck", "ScaleCheck", "TagName", "Tape", "check_distances", "parse_tag"]
+__all__ = [
+    "TAPE_SIGMA_M",
+    "ArmCheck",
+    "DistanceCheck",
+    "Finding",
+    "Refined",
+    "ScaleCheck",
+    "Sweep",
+    "TagName",
+    "Tape",
+    "check_arm",
+    "check_distances",
+    "find_sweep",
+    "late_ms",
+    "parse_tag",
+    "refine_arm",
+]

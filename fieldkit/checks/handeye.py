@@ -26,6 +26,12 @@ Mask = NDArray[np.bool_]
 HAND, LATENCY, CAMERA = slice(0, 6), 6, slice(7, 15)
 # What a joint's zero is known to (standard deviation), where tf has every joint
 JOINT_SIGMA_RAD = math.radians(0.1)
+# Blur, averaged in light and then encoded, moves edges into the dark: by so many seconds of an image's motion, and so
+# many pixels in every image (standard deviations). A tag is measured to such a share of its size
+SHRINK_S, EDGE_PX, SIZE_SHARE = 0.005, 0.1, 0.002
+# The arm's path between two samples of tf is taken as straight; what that is off by looks like late stamps, by so many
+# intervals between samples
+CHORD_INTERVALS = 0.05
 # A joint that turns less than this about its axis does not show which axis that is
 TURNED_RAD = math.radians(1.0)
 # What the noise of arm and images may be, each by itself; see `Noise`
@@ -83,9 +89,10 @@ def fit_sweep(sweep: Sweep, *, fixed: frozenset[int] = frozenset()) -> SweepFit:
 
     Unknowns: a pose of every tag in every stand; the correction of the camera in the hand (hand_from_cam * Exp(d));
     by how much stamps are late, with kinematics interpolated there; focal length, aspect, centre and distortion;
-    and, where tf has every joint, small errors of the joints' zeros. Residuals are corners, with their noise and that
-    of the arm, whose scale restricted maximum likelihood finds. ``fixed`` parameters keep their stated value. What is
-    known beforehand is wide: a parameter that the sweep does not show comes back with a sigma as wide.
+    where tf has every joint, small errors of the joints' zeros; by how much blur makes tags smaller; and their size.
+    Residuals are corners, with their noise and that of arm and motion, which restricted maximum likelihood finds.
+    ``fixed`` parameters keep their stated value. What is known beforehand is wide: a parameter that the sweep does
+    not show comes back with a sigma as wide.
     Raises TagError where the corners determine nothing.
     """
     problem = _Problem.of(sweep, fixed)
@@ -131,6 +138,8 @@ class _Problem:
     joints: tuple[tuple[int, Array], ...]
     prior: Array
     steps: Array
+    inwards: Array
+    shrinking: Array
     known_links: dict[int, list[Pose]]
 
     @staticmethod
@@ -139,7 +148,7 @@ class _Problem:
         parameters = (*hand_parameters(), latency_parameter(), *camera_parameters(camera))
         joints = _joint_axes(sweep)
         free = [i for i in range(len(parameters)) if i not in fixed]
-        free += range(len(parameters), len(parameters) + len(joints))
+        free += range(len(parameters), len(parameters) + len(joints) + 3)
         sizes = [s.size_m for s in sweep.stands]
         return _Problem(
             dataclasses.replace(sweep, camera=camera),
@@ -149,8 +158,10 @@ class _Problem:
             parameters,
             np.array(free),
             joints,
-            np.array([p.wide for p in parameters] + [JOINT_SIGMA_RAD] * len(joints)),
-            np.array([p.step for p in parameters] + [1e-5] * len(joints)),
+            np.array([p.wide for p in parameters] + [JOINT_SIGMA_RAD] * len(joints) + [SHRINK_S, EDGE_PX, SIZE_SHARE]),
+            np.array([p.step for p in parameters] + [1e-5] * len(joints) + [1e-4, 1e-2, 1e-5]),
+            _inwards(sweep.corners_px, None),
+            np.zeros((len(sweep), 4, 2)),
             {},
         )
 
@@ -165,7 +176,7 @@ class _Problem:
     def cameras(self, values: Array) -> Pose:
         """Return ref_from_cam (n)."""
         links = self.links(float(values[LATENCY]))
-        zeros = values[len(self.parameters) :]
+        zeros = values[len(self.parameters) : -3]
         result = self.sweep.ref_from_body
         for index, link in enumerate(links):
             turn = sum((axis * z for (i, axis), z in zip(self.joints, zeros, strict=True) if i == index), np.zeros(3))
@@ -176,11 +187,11 @@ class _Problem:
         """Return the corners' pixels (n, 4, 2)."""
         cam_from_tag = cameras.inv() * tags[self.sweep.stand]
         turn, shift = cam_from_tag.rotation.as_matrix(), cam_from_tag.translation
-        x_in_cam = np.einsum("nij,nkj->nki", turn, self.points) + shift[:, None]
+        x_in_cam = np.einsum("nij,nkj->nki", turn, math.exp(values[-1]) * self.points) + shift[:, None]
         xy = x_in_cam[..., :2] / np.maximum(x_in_cam[..., 2:], 1e-3)
         camera = changed(self.sweep.camera, values[CAMERA])
         pixels = camera.distort(xy.reshape(-1, 2)) * camera.focal_px + camera.centre_px
-        return pixels.reshape(-1, 4, 2)
+        return pixels.reshape(-1, 4, 2) + float(values[-3]) * self.shrinking + float(values[-2]) * self.inwards
 
     def residual(self, state: _State) -> Array:
         """Return the residuals (n, 8)."""
@@ -195,7 +206,7 @@ class _Problem:
             ahead = self.predict(cameras, state.tags * _exp(d), values)
             columns.append((ahead - self.predict(cameras, state.tags * _exp(-d), values)) / (2 * _TAG_STEP))
         for k in self.free:
-            columns.append(self._slope(state, cameras, int(k)))
+            columns.append(self.slope(state, cameras, int(k)))
         by_camera = []
         for d in _TAG_STEP * np.eye(6):
             ahead = self.predict(cameras * _exp(d), state.tags, values)
@@ -204,15 +215,15 @@ class _Problem:
             (self.observed - self.predict(cameras, state.tags, values)).reshape(n, 8),
             np.stack([c.reshape(n, 8) for c in columns], axis=2),
             np.stack([c.reshape(n, 8) for c in by_camera], axis=2),
-            self._slope(state, cameras, LATENCY).reshape(n, 8),
+            self.slope(state, cameras, LATENCY).reshape(n, 8),
         )
 
-    def _slope(self, state: _State, cameras: Pose, k: int) -> Array:
+    def slope(self, state: _State, cameras: Pose, k: int) -> Array:
         """Return the derivative (n, 4, 2) of the predicted pixels by a number."""
         step = np.zeros(len(self.prior))
         step[k] = self.steps[k]
         ahead, behind = state.values + step, state.values - step
-        moves = k <= LATENCY or k >= len(self.parameters)
+        moves = k <= LATENCY or len(self.parameters) <= k < len(self.prior) - 3
         high = self.predict(self.cameras(ahead) if moves else cameras, state.tags, ahead)
         low = self.predict(self.cameras(behind) if moves else cameras, state.tags, behind)
         return (high - low) / (2 * float(self.steps[k]))
@@ -292,6 +303,7 @@ def _fit(problem: _Problem, sweep: Sweep) -> SweepFit:
     before = problem.residual(state)
     noise, used = Noise(), np.ones(len(sweep), dtype=bool)
     for _ in range(8):
+        problem = dataclasses.replace(problem, shrinking=_inwards(problem.observed, _speed(problem, state)))
         state = _minimise(problem, state, used, noise)
         linear = problem.linearise(state)
         shown = _noise(problem, state, linear, used, noise)
@@ -313,8 +325,34 @@ def _fit(problem: _Problem, sweep: Sweep) -> SweepFit:
     inside = first + np.flatnonzero(own)
     covariance = np.zeros((count, count))
     covariance[np.ix_(problem.free[own], problem.free[own])] = inverse[np.ix_(inside, inside)]
+    covariance[LATENCY, LATENCY] += (CHORD_INTERVALS * _interval_s(sweep)) ** 2
     old, new = (float(np.sqrt(np.mean(r[used] ** 2))) for r in (before, linear.residual))
     return SweepFit(problem.parameters, state.values[:count], covariance, noise, used, (old, new))
+
+
+def _interval_s(sweep: Sweep) -> float:
+    """Return the time in s between two samples of the arm's transforms."""
+    moving = [(target, source) for target, source, moves in sweep.kinematics.steps if moves]
+    return max(sweep.kinematics.tf.interval_ns(*frames) for frames in moving) / 1e9
+
+
+def _speed(problem: _Problem, state: _State) -> Array:
+    """Return the motion (n, 4, 2) of the corners in px/s."""
+    return problem.slope(state, problem.cameras(state.values), LATENCY)
+
+
+def _inwards(corners: Array, speed: Array | None) -> Array:
+    """Return how corners (n, 4, 2) of a black square move where all its edges move into it.
+
+    Every edge moves by one pixel; or, with the motion of its corner (n, 4, 2), by what that has along its normal.
+    """
+    along = np.roll(corners, -1, axis=1) - corners
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1) / np.linalg.norm(along, axis=-1, keepdims=True)
+    outwards = np.sum(normal * (corners - corners.mean(axis=1, keepdims=True)), axis=-1, keepdims=True)
+    normal = normal * np.sign(outwards)
+    both = np.stack([normal, np.roll(normal, 1, axis=1)], axis=-2)
+    by = np.ones((len(corners), 4, 2, 1)) if speed is None else np.abs(both @ speed[..., None])
+    return np.asarray(np.linalg.solve(both, -by)[..., 0], dtype=np.float64)
 
 
 def _chi2(residual: Array, weights: Array) -> Array:

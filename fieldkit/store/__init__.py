@@ -12,16 +12,19 @@ from fieldkit.store.files import (
     write_toml,
 )
 from fieldkit.store.inputs import (
+    Hand,
     PhotoEntry,
     Rig,
     RigCamera,
     SessionFile,
     read_camera,
+    read_hand,
     read_photos,
     read_rig,
     read_session,
     read_tum,
     write_camera,
+    write_hand,
     write_photos,
     write_rig,
     write_session,
@@ -33,6 +36,7 @@ from fieldkit.store.versions import library_versions
 
 __all__ = [
     "EstimateCache",
+    "Hand",
     "PhotoEntry",
     "Rig",
     "RigCamera",
@@ -44,6 +48,7 @@ __all__ = [
     "library_versions",
     "plain_json",
     "read_camera",
+    "read_hand",
     "read_json",
     "read_photos",
     "read_rig",
@@ -54,6 +59,7 @@ __all__ = [
     "read_tum",
     "refuse_existing",
     "write_camera",
+    "write_hand",
     "write_photos",
     "write_rig",
     "write_run",

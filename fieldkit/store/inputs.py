@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, StoreError
-from fieldkit.frames import Pose, pose, position_quaternion
+from fieldkit.frames import Array, Pose, pose, position_quaternion
 from fieldkit.store.files import atomic_write, read_text, read_toml, write_toml
 from fieldkit.types import ViewKind
 
@@ -39,6 +40,44 @@ def read_camera(path: Path) -> Camera:
 def write_camera(path: Path, camera: Camera, *, rms_px: float | None = None) -> None:
     """Write camera.toml."""
     write_toml(path, _CameraFile(1, camera.model, camera.width, camera.height, list(camera.params), rms_px))
+
+
+class _HandFile(msgspec.Struct, forbid_unknown_fields=True):
+    version: Literal[1]
+    parent: str
+    child: str
+    position_m: list[float]
+    quaternion_xyzw: list[float]
+    covariance: list[float] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Hand:
+    """Where the camera sits in the hand: two frames of tf, hand_from_cam, and its 6x6 covariance where it is known."""
+
+    parent: str
+    child: str
+    hand_from_cam: Pose
+    covariance: Array | None = None
+
+
+def read_hand(path: Path) -> Hand:
+    """Read hand.toml: parent and child frame, position_m, quaternion_xyzw of hand_from_cam, covariance?."""
+    data = read_toml(path, _HandFile, what="hand.toml with parent, child, position_m and quaternion_xyzw")
+    try:
+        if data.covariance is not None and len(data.covariance) != 36:
+            raise StoreError(f"covariance has {len(data.covariance)} numbers; expected 36, row-major")
+        covariance = None if data.covariance is None else np.asarray(data.covariance).reshape(6, 6)
+        return Hand(data.parent, data.child, pose(data.position_m, data.quaternion_xyzw), covariance)
+    except FieldkitError as error:
+        raise StoreError(f"{path}: {error.message}", hint=error.hint) from error
+
+
+def write_hand(path: Path, hand: Hand) -> None:
+    """Write hand.toml."""
+    xyz, quaternion = position_quaternion(hand.hand_from_cam)
+    covariance = None if hand.covariance is None else [float(v) for v in np.asarray(hand.covariance).ravel()]
+    write_toml(path, _HandFile(1, hand.parent, hand.child, xyz, quaternion, covariance))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,160 @@
+"""What a sweep of the arm says about the camera, its place in the hand, and its stamps; refined on request."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import numpy as np
+
+from fieldkit.cameras import Camera
+from fieldkit.checks.handeye import CAMERA, HAND, LATENCY, SweepFit, fit_sweep
+from fieldkit.checks.parameters import changed, refinable
+from fieldkit.checks.sweeps import Sweep
+from fieldkit.errors import TagError
+from fieldkit.frames import Array, Pose, exp
+
+SIGMAS = 3.0
+FOCAL, CENTRE = 7, (9, 10)
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One number beside its stated value: deviation and sigma in ``unit``, and the verdict.
+
+    "pass": within so many sigmas. "warn": beyond, by less than ``tolerance``. "fail": beyond, by more. "unknown": the
+    sweep does not show it, its sigma exceeds ``tolerance``.
+    """
+
+    name: str
+    group: str
+    unit: str
+    deviation: float
+    sigma: float
+    tolerance: float
+    verdict: Literal["pass", "warn", "fail", "unknown"]
+
+    @property
+    def sigmas(self) -> float:
+        """Deviation in standard deviations."""
+        return self.deviation / self.sigma if self.sigma else 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class ArmCheck:
+    """All findings of a sweep, and the fit that they rest on."""
+
+    sweep: Sweep
+    fit: SweepFit
+    findings: tuple[Finding, ...]
+
+    @property
+    def verdict(self) -> Literal["pass", "warn", "fail", "unknown"]:
+        """The worst verdict among what the sweep shows; unknown where it shows nothing."""
+        verdicts = {f.verdict for f in self.findings}
+        return next((v for v in ("fail", "warn", "pass") if v in verdicts), "unknown")
+
+
+@dataclasses.dataclass(frozen=True)
+class Refined:
+    """Camera and hand_from_cam as the sweep shows them, hand_from_cam with its 6x6 covariance.
+
+    ``kept`` names what keeps its stated value, since the sweep does not show it. ``hand_from_cam`` is None where tf
+    has no fixed transform to the camera.
+    """
+
+    camera: Camera
+    hand_from_cam: Pose | None
+    covariance: Array
+    rms_px: float
+    kept: tuple[str, ...]
+
+
+def check_arm(sweep: Sweep, *, sigmas: float = SIGMAS) -> ArmCheck:
+    """Fit a sweep and compare camera, hand_from_cam and stamps with what is stated.
+
+    A deviation counts from ``sigmas`` standard deviations. Raises TagError where the sweep determines nothing.
+    """
+    fit = fit_sweep(sweep)
+    findings = []
+    for i, p in enumerate(fit.parameters):
+        deviation, sigma = float(fit.values[i]), fit.sigma(i)
+        verdict: Literal["pass", "warn", "fail", "unknown"] = "pass"
+        if sigma > p.tolerance:
+            verdict = "unknown"
+        elif abs(deviation) > sigmas * sigma:
+            verdict = "fail" if abs(deviation) > p.tolerance else "warn"
+        f = p.factor
+        findings.append(Finding(p.name, p.group, p.unit, f * deviation, f * sigma, f * p.tolerance, verdict))
+    return ArmCheck(sweep, fit, tuple(findings))
+
+
+def refine_arm(check: ArmCheck, *, what: Literal["camera", "hand"]) -> Refined:
+    """Return camera and hand_from_cam as the sweep shows them, fitted together.
+
+    What of the camera the sweep does not show keeps its stated value, and the rest is fitted again. Raises TagError
+    where it does not show what is to be refined: of the camera focal length and centre, of the hand all six numbers.
+    """
+    fit, kept = _fit_what_shows(check)
+    needed = range(*HAND.indices(15)) if what == "hand" else (FOCAL, *CENTRE)
+    hidden = [i for i in needed if i in kept or fit.sigma(i) > fit.parameters[i].tolerance]
+    if hidden:
+        listed = ", ".join(_shown(fit, i) if i not in kept else fit.parameters[i].name for i in hidden)
+        raise TagError(
+            f"{check.sweep.path}: the sweep does not show {listed}; expected it to, to refine the {what}",
+            hint="turn the hand about several axes, and let the tag wander all over the image",
+        )
+    mount = check.sweep.kinematics.mount
+    if what == "hand" and mount is None:
+        raise TagError(
+            f"{check.sweep.path}: tf moves the camera itself, in {check.sweep.kinematics.steps[-1][0]!r}; expected a "
+            "fixed transform from the hand to refine",
+            hint="record the camera's transform on tf_static",
+        )
+    camera = changed(refinable(check.sweep.camera), fit.values[CAMERA])
+    names = tuple(fit.parameters[i].name for i in sorted(kept))
+    hand = None if mount is None else mount[1] * exp(fit.values[HAND])
+    return Refined(camera, hand, fit.covariance[HAND, HAND], fit.rms_px[1], names)
+
+
+def _fit_what_shows(check: ArmCheck) -> tuple[SweepFit, frozenset[int]]:
+    """Fix what of the camera does not show, the least of it first, until the rest does."""
+    fit, kept = check.fit, frozenset[int]()
+    cameras = range(*CAMERA.indices(15))
+    while True:
+        worst = max((i for i in cameras if i not in kept), key=lambda i: _excess(fit, i), default=None)
+        if worst is None or _excess(fit, worst) <= 1.0:
+            return fit, kept
+        kept |= {worst}
+        fit = fit_sweep(check.sweep, fixed=kept)
+
+
+def _excess(fit: SweepFit, index: int) -> float:
+    return fit.sigma(index) / fit.parameters[index].tolerance
+
+
+def _shown(fit: SweepFit, index: int) -> str:
+    p = fit.parameters[index]
+    return f"{p.name} (known to {p.factor * fit.sigma(index):.3g} {p.unit} only, {p.factor * p.tolerance:.3g} matter)"
+
+
+def late_ms(check: ArmCheck) -> tuple[float, float]:
+    """Return by how many ms stamps are late, and the sigma."""
+    return 1e3 * float(check.fit.values[LATENCY]), 1e3 * check.fit.sigma(LATENCY)
+
+
+def seen_share(sweep: Sweep) -> float:
+    """Return the share of the image's width and height, the smaller one, over which tags were seen."""
+    reach = np.ptp(sweep.corners_px.reshape(-1, 2), axis=0)
+    return float(min(reach / (sweep.camera.width, sweep.camera.height)))
+
+
+def turned_deg(sweep: Sweep) -> float:
+    """Return the largest angle in deg by which the camera turned against the body between two sightings."""
+    links, _ = sweep.kinematics.links([int(t) for t in sweep.t_ns])
+    body_from_cam = links[0]
+    for link in links[1:]:
+        body_from_cam = body_from_cam * link
+    relative = body_from_cam[0].rotation.inv() * body_from_cam.rotation
+    return math.degrees(float(np.max(relative.magnitude())))
