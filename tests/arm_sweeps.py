@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from fieldkit.bags import RecordingWriter
 from fieldkit.cameras import Camera
 from fieldkit.frames import Array, Pose, exp, log
+from fieldkit.tags import detect
 from sim_bridge import robot
 from sim_bridge.recording import recorder
 from sim_bridge.recording.recorder import Sensed
@@ -21,6 +24,7 @@ from sim_bridge.stage import staging
 from sim_bridge.stage.paths import Track, TrackBuilder
 
 SIZE_M = 0.1365
+KINEMATICS = robot.KinematicOptions()
 STAGE = staging.StageOptions(waypoints=0, start_places=1)
 
 
@@ -41,6 +45,9 @@ class Stated:
     focal: float = 0.0
 
 
+AS_IT_IS = Stated()
+
+
 @functools.cache
 def before_tag() -> staging.Stage:
     """A robot that stands before the start tag of a room."""
@@ -53,7 +60,7 @@ def sweep(
     poses: int = 20,
     moving: bool = True,
     turning: tuple[str, ...] = robot.JOINTS,
-    kinematics: robot.KinematicOptions = robot.KinematicOptions(),
+    kinematics: robot.KinematicOptions = KINEMATICS,
     sensors: Sensors = STANDARD,
 ) -> Swept:
     """Stand before a tag and let the arm go through random poses that see it, with images there and on the way."""
@@ -62,7 +69,7 @@ def sweep(
     arms = _arms(stage, poses, turning, rng)
     track, shots = TrackBuilder(arms[0].as_array()), []
     track.hold(1.0)
-    for before, arm in zip(arms, arms[1:], strict=False):
+    for before, arm in itertools.pairwise(arms):
         seconds = max(0.4, 1.5 * float(np.abs(arm.as_array() - before.as_array()).max()) / 0.7)
         if moving:
             shots.append(Shot(track.t_s + seconds * float(rng.uniform(0.3, 0.7))))
@@ -103,25 +110,46 @@ def _arms(
     return found
 
 
-def write(path: Path, swept: Swept, stated: Stated = Stated(), *, layout: str = "generic") -> Path:
-    """Write an MCAP recording with the errors of ``stated`` in its tf, stamps and CameraInfo."""
+def write(path: Path, swept: Swept, stated: Stated = AS_IT_IS, *, layout: str = "generic", images: bool = True) -> Path:
+    """Write an MCAP recording with the errors of ``stated`` in its tf, stamps and CameraInfo.
+
+    Without ``images`` it holds apriltag_ros' detections in their place.
+    """
     sensed = swept.sensed
     fx, fy, *rest = sensed.camera.params
-    said = Camera(
-        sensed.camera.model,
-        sensed.camera.width,
-        sensed.camera.height,
-        (fx * (1 + stated.focal), fy * (1 + stated.focal), *rest),
-    )
+    params = (fx * (1 + stated.focal), fy * (1 + stated.focal), *rest)
+    said = Camera(sensed.camera.model, sensed.camera.width, sensed.camera.height, params)
     with RecordingWriter(path, format="mcap", layout=layout) as writer:
         names = writer.layout
         writer.tf_static([(names.arm_frames[-1], names.camera_frame, said_mount(stated))])
         for state in sensed.states:
-            recorder._write_state(writer, state)
+            body = (names.odom_frame, names.body_frame, state.odom_from_body)
+            links = robot.moving_links(state.arm, names.arm_frames, body=names.body_frame)
+            writer.odometry(state.t_ns, state.odom_from_body, state.twist)
+            writer.tf(state.t_ns, [body, *links])
         for image in sensed.images:
-            writer.camera_info(image.t_ns + stated.late_ns, said)
-            writer.image(image.t_ns + stated.late_ns, image.jpeg)
+            t_ns = image.t_ns + stated.late_ns
+            writer.camera_info(t_ns, said)
+            if images:
+                writer.image(t_ns, image.jpeg)
+            else:
+                _write_detections(writer, t_ns, image.jpeg, sensed.camera)
     return path
+
+
+def _write_detections(writer: RecordingWriter, t_ns: int, jpeg: bytes, camera: Camera) -> None:
+    assert writer._open is not None
+    store = writer._open.container.store
+    point = store.types["apriltag_msgs/msg/Point"]
+    kind = store.types["apriltag_msgs/msg/AprilTagDetection"]
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    found = [
+        kind(d.family, d.id, 0, 0.0, 60.0, point(0.0, 0.0), [point(*c) for c in d.corners_px.tolist()], np.zeros(9))
+        for d in detect(np.asarray(image, dtype=np.uint8), camera)
+    ]
+    header = writer._header(t_ns, writer.layout.camera_frame)
+    message = store.types["apriltag_msgs/msg/AprilTagDetectionArray"](header, found)
+    writer._write("/detections", message, t_ns)
 
 
 def said_mount(stated: Stated) -> Pose:

@@ -49,7 +49,7 @@ class Kinematics:
 
 @dataclasses.dataclass(frozen=True)
 class ArmRecording:
-    """Images of the arm camera in the order of their stamps, its kinematics, and odometry where there is any."""
+    """Images of the arm camera, its calibrations, both in the order of stamps, kinematics, and odometry if any."""
 
     path: str
     frames: tuple[Frame, ...]
@@ -57,6 +57,10 @@ class ArmRecording:
     kinematics: Kinematics
     odometry: Trajectory | None
     warnings: tuple[str, ...]
+
+    def camera_at(self, t_ns: int) -> Camera:
+        """Return the calibration whose stamp is nearest."""
+        return min(self.cameras, key=lambda item: abs(item[0] - t_ns))[1]
 
 
 def open_arm(path: Path | str, *, layout: str | Layout | None = None) -> ArmRecording:

@@ -1,6 +1,6 @@
 """Checks with what a lab has: a tape measure between tags, and an arm that sweeps its camera over them."""
 
-from fieldkit.checks.arm import ArmCheck, Finding, Refined, check_arm, late_ms, refine_arm
+from fieldkit.checks.arm import ArmCheck, Finding, Refined, check_arm, refine_arm
 from fieldkit.checks.distances import (
     TAPE_SIGMA_M,
     DistanceCheck,
@@ -25,7 +25,6 @@ __all__ = [
     "check_arm",
     "check_distances",
     "find_sweep",
-    "late_ms",
     "parse_tag",
     "refine_arm",
 ]

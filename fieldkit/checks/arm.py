@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Literal
 
 import numpy as np
 
 from fieldkit.cameras import Camera
-from fieldkit.checks.handeye import CAMERA, HAND, LATENCY, SweepFit, fit_sweep
+from fieldkit.checks.handeye import SweepFit, fit_sweep
 from fieldkit.checks.parameters import changed, refinable
+from fieldkit.checks.sweep_problem import CAMERA, HAND
 from fieldkit.checks.sweeps import Sweep
 from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, exp
@@ -96,11 +96,16 @@ def refine_arm(check: ArmCheck, *, what: Literal["camera", "hand"]) -> Refined:
     What of the camera the sweep does not show keeps its stated value, and the rest is fitted again. Raises TagError
     where it does not show what is to be refined: of the camera focal length and centre, of the hand all six numbers.
     """
-    fit, kept = _fit_what_shows(check)
-    needed = range(*HAND.indices(15)) if what == "hand" else (FOCAL, *CENTRE)
-    hidden = [i for i in needed if i in kept or fit.sigma(i) > fit.parameters[i].tolerance]
+    kept, covariance = _what_shows(check.fit)
+    needed = range(*HAND.indices(len(covariance))) if what == "hand" else (FOCAL, *CENTRE)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    hidden = [p for i, p in enumerate(check.fit.parameters) if i in needed and (i in kept or sigma[i] > p.tolerance)]
     if hidden:
-        listed = ", ".join(_shown(fit, i) if i not in kept else fit.parameters[i].name for i in hidden)
+        known = {p.name: p.factor * check.fit.sigma(i) for i, p in enumerate(check.fit.parameters)}
+        listed = ", ".join(
+            f"{p.name} (known to {known[p.name]:.3g} {p.unit} only, {p.factor * p.tolerance:.3g} matter)"
+            for p in hidden
+        )
         raise TagError(
             f"{check.sweep.path}: the sweep does not show {listed}; expected it to, to refine the {what}",
             hint="turn the hand about several axes, and let the tag wander all over the image",
@@ -112,49 +117,27 @@ def refine_arm(check: ArmCheck, *, what: Literal["camera", "hand"]) -> Refined:
             "fixed transform from the hand to refine",
             hint="record the camera's transform on tf_static",
         )
+    fit = fit_sweep(check.sweep, fixed=kept) if kept else check.fit
     camera = changed(refinable(check.sweep.camera), fit.values[CAMERA])
     names = tuple(fit.parameters[i].name for i in sorted(kept))
     hand = None if mount is None else mount[1] * exp(fit.values[HAND])
     return Refined(camera, hand, fit.covariance[HAND, HAND], fit.rms_px[1], names)
 
 
-def _fit_what_shows(check: ArmCheck) -> tuple[SweepFit, frozenset[int]]:
-    """Fix what of the camera does not show, the least of it first, until the rest does."""
-    fit, kept = check.fit, frozenset[int]()
-    cameras = range(*CAMERA.indices(15))
+def _what_shows(fit: SweepFit) -> tuple[frozenset[int], Array]:
+    """Fix what of the camera does not show, the least of it first, until the rest does; return what, and the covariance.
+
+    With a value fixed the others' covariance is the conditional one.
+    """
+    tolerance = np.array([p.tolerance for p in fit.parameters])
+    cameras = np.arange(*CAMERA.indices(len(tolerance)))
+    covariance, kept = fit.covariance.copy(), frozenset[int]()
     while True:
-        worst = max((i for i in cameras if i not in kept), key=lambda i: _excess(fit, i), default=None)
-        if worst is None or _excess(fit, worst) <= 1.0:
-            return fit, kept
+        excess = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / tolerance
+        worst = int(cameras[np.argmax(excess[cameras])])
+        if excess[worst] <= 1.0:
+            return kept, covariance
+        column = covariance[:, worst].copy()
+        covariance -= np.outer(column, column) / column[worst]
+        covariance[worst], covariance[:, worst] = 0.0, 0.0
         kept |= {worst}
-        fit = fit_sweep(check.sweep, fixed=kept)
-
-
-def _excess(fit: SweepFit, index: int) -> float:
-    return fit.sigma(index) / fit.parameters[index].tolerance
-
-
-def _shown(fit: SweepFit, index: int) -> str:
-    p = fit.parameters[index]
-    return f"{p.name} (known to {p.factor * fit.sigma(index):.3g} {p.unit} only, {p.factor * p.tolerance:.3g} matter)"
-
-
-def late_ms(check: ArmCheck) -> tuple[float, float]:
-    """Return by how many ms stamps are late, and the sigma."""
-    return 1e3 * float(check.fit.values[LATENCY]), 1e3 * check.fit.sigma(LATENCY)
-
-
-def seen_share(sweep: Sweep) -> float:
-    """Return the share of the image's width and height, the smaller one, over which tags were seen."""
-    reach = np.ptp(sweep.corners_px.reshape(-1, 2), axis=0)
-    return float(min(reach / (sweep.camera.width, sweep.camera.height)))
-
-
-def turned_deg(sweep: Sweep) -> float:
-    """Return the largest angle in deg by which the camera turned against the body between two sightings."""
-    links, _ = sweep.kinematics.links([int(t) for t in sweep.t_ns])
-    body_from_cam = links[0]
-    for link in links[1:]:
-        body_from_cam = body_from_cam * link
-    relative = body_from_cam[0].rotation.inv() * body_from_cam.rotation
-    return math.degrees(float(np.max(relative.magnitude())))

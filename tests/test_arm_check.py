@@ -1,0 +1,149 @@
+"""Hand-eye calibration from recordings of sim_bridge's arm before a tag: what is stated wrongly is found."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm_sweeps import SIZE_M, Stated, Swept, said_mount, sweep, true_correction, write
+from bag_samples import Options, write_sample
+
+from fieldkit.bags import open_arm
+from fieldkit.checks import ArmCheck, check_arm, find_sweep, refine_arm
+from fieldkit.cli import main
+from fieldkit.errors import BagError, TagError
+from fieldkit.frames import pose_error
+from fieldkit.store import read_camera, read_hand, write_tags
+from fieldkit.types import TagMap
+from sim_bridge import robot
+
+WRONG = Stated(hand=(0.02, -0.03, 0.015, 0.01, -0.02, 0.02), late_ns=40_000_000, focal=0.03)
+SIZES = {None: SIZE_M}
+
+
+@pytest.fixture(scope="module")
+def swept() -> Swept:
+    return sweep(3, poses=16)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, swept: Swept) -> Path:
+    return write(tmp_path_factory.mktemp("arm") / "wrong.mcap", swept, WRONG)
+
+
+@pytest.fixture(scope="module")
+def wrong(recording: Path) -> ArmCheck:
+    return check_arm(find_sweep(open_arm(recording), SIZES))
+
+
+def verdicts(check: ArmCheck) -> dict[str, str]:
+    return {f.name: f.verdict for f in check.findings}
+
+
+def expected(swept: Swept, stated: Stated) -> np.ndarray:
+    return np.array([*true_correction(swept, stated), stated.late_ns / 1e9, -math.log1p(stated.focal), *np.zeros(7)])
+
+
+def test_a_wrong_hand_late_stamps_and_a_wrong_focal_length_are_found_within_their_sigma(
+    swept: Swept, wrong: ArmCheck
+) -> None:
+    deviation = (wrong.fit.values - expected(swept, WRONG)) / np.sqrt(np.diag(wrong.fit.covariance))
+    assert np.abs(deviation).max() < 3.5
+    assert float(np.mean(deviation**2)) < 2.0
+    sigmas = {f.name: f.sigma for f in wrong.findings}
+    assert sigmas["stamps late by"] < 5.0
+    assert sigmas["focal length"] < 0.5
+    assert max(sigmas[f"position {axis}"] for axis in "xyz") < 4.0
+
+
+def test_what_is_stated_wrongly_fails_and_what_is_stated_rightly_passes(wrong: ArmCheck) -> None:
+    found = verdicts(wrong)
+    off = [f"rotation {axis}" for axis in "xyz"] + ["position y", "position z", "stamps late by", "focal length"]
+    assert {found[name] for name in off} == {"fail"}
+    assert {found[name] for name in ("fy over fx", "centre x", "centre y", "p1", "p2")} == {"pass"}
+    assert wrong.verdict == "fail"
+    assert wrong.fit.rms_px[0] > 5.0
+    assert wrong.fit.rms_px[1] < 0.7
+
+
+def test_a_recording_that_states_the_truth_passes(tmp_path: Path, swept: Swept) -> None:
+    check = check_arm(find_sweep(open_arm(write(tmp_path / "right.mcap", swept)), SIZES))
+    assert check.verdict == "pass"
+    assert "fail" not in verdicts(check).values()
+
+
+def test_camera_and_hand_are_refined_to_what_they_are(swept: Swept, wrong: ArmCheck) -> None:
+    refined = refine_arm(wrong, what="hand")
+    assert refined.hand_from_cam is not None
+    position, angle = pose_error(refined.hand_from_cam, swept.wrist_from_camera)
+    assert position < 0.006 < pose_error(said_mount(WRONG), swept.wrist_from_camera)[0]
+    assert math.degrees(angle) < 0.3
+    camera = refine_arm(wrong, what="camera").camera
+    assert camera.focal_px == pytest.approx(robot.ARM_CAMERA.focal_px, rel=0.01)
+    assert np.linalg.eigvalsh(refined.covariance).min() > 0
+
+
+def test_a_driver_that_gives_the_wrist_alone_is_checked_too(tmp_path: Path, swept: Swept) -> None:
+    path = write(tmp_path / "spot.mcap", swept, WRONG, layout="spot_ros1")
+    check = check_arm(find_sweep(open_arm(path), SIZES))
+    deviation = (check.fit.values - expected(swept, WRONG)) / np.sqrt(np.diag(check.fit.covariance))
+    assert np.abs(deviation[[0, 1, 2, 6, 7]]).max() < 4.0
+    assert verdicts(check)["stamps late by"] == "fail"
+
+
+def test_recorded_detections_take_the_place_of_images(tmp_path: Path, swept: Swept) -> None:
+    path = write(tmp_path / "tags.mcap", swept, WRONG, images=False)
+    found = find_sweep(open_arm(path), SIZES)
+    assert len(found) > 20
+    assert verdicts(check_arm(found))["stamps late by"] == "fail"
+
+
+def test_an_arm_that_stands_at_every_image_shows_no_latency(tmp_path: Path) -> None:
+    still = sweep(5, poses=12, moving=False)
+    check = check_arm(find_sweep(open_arm(write(tmp_path / "still.mcap", still)), SIZES))
+    assert verdicts(check)["stamps late by"] == "unknown"
+    assert verdicts(check)["rotation z"] == "pass"
+
+
+def test_a_hand_that_turns_about_one_axis_cannot_be_refined(tmp_path: Path) -> None:
+    flat = sweep(6, poses=10, turning=("sh0",))
+    check = check_arm(find_sweep(open_arm(write(tmp_path / "flat.mcap", flat)), SIZES))
+    assert "unknown" in {verdicts(check)[f"position {axis}"] for axis in "xyz"}
+    with pytest.raises(
+        TagError, match=r"the sweep does not show .*position .* only, 10 matter.*to refine the hand; turn"
+    ):
+        refine_arm(check, what="hand")
+
+
+def test_the_command_says_what_is_wrong_and_writes_what_it_found(
+    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_tags(tmp_path / "tags.toml", TagMap((), (), "map"))
+    words = ["tags", "check", tmp_path / "tags.toml", "--recording", recording, "--size-m", SIZE_M, "--json"]
+    out = ["--refine-camera", tmp_path / "camera.toml", "--refine-hand", tmp_path / "hand.toml"]
+    with pytest.raises(SystemExit) as stop:
+        main([str(w) for w in (*words, *out)])
+    said = json.loads(capsys.readouterr().out)["arm"]
+    assert stop.value.code == 3
+    assert said["verdict"] == "fail"
+    assert {f["name"]: f["verdict"] for f in said["findings"]}["focal length"] == "fail"
+    assert read_camera(tmp_path / "camera.toml").focal_px == pytest.approx(robot.ARM_CAMERA.focal_px, rel=0.01)
+    hand = read_hand(tmp_path / "hand.toml")
+    assert (hand.parent, hand.child) == ("arm_link_wr1", "arm_camera")
+
+
+def test_a_recording_without_tags_kinematics_or_sizes_is_named(tmp_path: Path, recording: Path) -> None:
+    bare = open_arm(write_sample(tmp_path, "mcap"))
+    with pytest.raises(TagError, match=r"robot\.mcap: 0 sightings of tags in .* expected one tag at least 3 times"):
+        find_sweep(bare, SIZES)
+    with pytest.raises(TagError, match=r"0 sightings of tags in .*sizes are known of tag 77\); sweep the arm"):
+        find_sweep(open_arm(recording), {77: 0.1})
+    (tmp_path / "b").mkdir()
+    path = write_sample(tmp_path / "b", "mcap", Options(without=frozenset({"tf"})))
+    with pytest.raises(
+        BagError, match=r"robot\.mcap: tf does not connect 'arm_camera'.* expected the arm's transforms"
+    ):
+        open_arm(path)
