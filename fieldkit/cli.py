@@ -19,6 +19,7 @@ from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
+from fieldkit.tag_tables import print_tags, tags_json
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
 
@@ -122,37 +123,12 @@ def tags_calibrate(
         tags = calibrate_tags(photos, map, camera=camera, sizes_m=parse_sizes(size_m), progress=progress)
     store.write_tags(out, tags)
     if json:
-        print_json(_tags_json(tags))
+        print_json(tags_json(tags))
         return
-    table = make_table("tag", "visit", "photos", "rms px", "sigma mm", "sigma deg", "verdict")
-    for t in tags.tags:
-        position, rotation = _sigmas(t.covariance)
-        row = [t.id, t.visit or "-", t.n_photos, f"{t.rms_px:.2f}", f"{1e3 * position:.2f}", f"{rotation:.3f}"]
-        table.add_row(*cells([*row, t.verdict]))
-    Console().print(table)
+    print_tags(tags)
     for photo in tags.photos:
         if not photo.used:
             logging.getLogger(__name__).warning("%s: not used: %s", photo.file, photo.reason)
-
-
-def _tags_json(tags: Any) -> dict[str, Any]:
-    entries = [
-        {
-            "id": t.id,
-            "visit": t.visit,
-            "position_m": t.map_from_tag.translation,
-            "quaternion_xyzw": t.map_from_tag.rotation.as_quat(),
-            "covariance": t.covariance.ravel(),
-            "n_photos": t.n_photos,
-            "rms_px": t.rms_px,
-            "verdict": t.verdict,
-        }
-        for t in tags.tags
-    ]
-    photos = [
-        {"file": p.file, "tag_id": p.tag_id, "visit": p.visit, "used": p.used, "reason": p.reason} for p in tags.photos
-    ]
-    return {"version": 1, "map_digest": tags.map_digest, "tags": entries, "photos": photos}
 
 
 def localize(
@@ -407,13 +383,6 @@ def _estimate_json(estimate: Any) -> dict[str, Any]:
         "covariance": None if estimate.covariance is None else estimate.covariance.ravel(),
         "seconds": dict(estimate.seconds),
     }
-
-
-def _sigmas(covariance: Any) -> tuple[float, float]:
-    """Return the standard deviations of position (m) and rotation (deg) of a 6x6 covariance."""
-    import numpy as np
-
-    return float(np.sqrt(np.trace(covariance[3:, 3:]))), float(np.degrees(np.sqrt(np.trace(covariance[:3, :3]))))
 
 
 if __name__ == "__main__":

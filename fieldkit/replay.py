@@ -322,4 +322,5 @@ def _collect(
         plan_view=plan_view(scene_map, seed=protocol.seed),
         thumbnails={k: v for s in sessions for k, v in s.thumbnails.items()},
         excluded=tuple(e for s in sessions for e in s.excluded),
+        tags=tags if tags.tags else None,
     )

@@ -171,7 +171,7 @@ def test_one_photo_is_allowed_and_says_what_that_means(caplog: pytest.LogCapture
     assert stored.size_from_map is None
     with caplog.at_level(logging.WARNING):
         warn(solved.tags, [])
-    assert "tag 0: one photo only: nothing tells whether it is right" in caplog.text
+    assert "tag 0: warn: one photo only: nothing tells whether it is right" in caplog.text
 
 
 def test_two_photos_that_disagree_fail_the_tag() -> None:

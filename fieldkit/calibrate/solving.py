@@ -25,9 +25,8 @@ from fieldkit.calibrate.starting import Group, Homeless, Sighted, group, sight
 from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, compose_covariance, pose_error
 from fieldkit.frames import log as pose_log
+from fieldkit.types import TAG_BOUNDS
 
-# A tag's size is wrong where the map's scale says so by that many sigmas, and by at least this share
-SIZE_SIGMAS, SIZE_SHARE = 4.0, 0.005
 # A photo known no better than this is not localized
 LOST_SIGMA_M = 10.0
 # Squared deviation (6 degrees of freedom) up to which a rejected sighting's other solution is the tag: one in 10^5
@@ -207,7 +206,9 @@ def _measure_sizes(problem: _Problem, consensus: Mask) -> _Sizes:
     sigma = np.sqrt(np.diag(free.adjusted.covariance)[-n:] * free.inflation)
     measured = free.adjusted.state.sizes_m
     deviation = np.abs(np.log(measured / given))
-    return _Sizes(measured, sigma, (deviation > SIZE_SIGMAS * sigma) & (deviation > SIZE_SHARE), given)
+    return _Sizes(
+        measured, sigma, (deviation > TAG_BOUNDS.size_sigmas * sigma) & (deviation > TAG_BOUNDS.size_share), given
+    )
 
 
 def _sightings(

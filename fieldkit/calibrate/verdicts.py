@@ -11,23 +11,18 @@ import numpy as np
 
 from fieldkit.calibrate.locating import LocatedPhoto
 from fieldkit.calibrate.solving import Solved, SolvedSighting, SolvedTag
-from fieldkit.types import TagPhoto, TagPose
+from fieldkit.types import TAG_BOUNDS, TagPhoto, TagPose
 
 log = logging.getLogger(__name__)
 
-# A tag known worse than this, 1 sigma per axis, deserves a warning
-WARN_SIGMA_M, WARN_SIGMA_RAD = 0.01, math.radians(0.5)
-# A size that is wrong by more than this share makes the tag useless; below, the map's scale may be what is wrong
-FAIL_SIZE_SHARE = 0.03
 # A size that photos show no better than this is not shown
 SHOWN_SIZE_SHARE = 0.1
-# Fewer photos cannot outvote a wrong one
-ENOUGH_PHOTOS = 3
 
 
 def tag_pose(tag: SolvedTag) -> TagPose:
     """Return a solved tag as it is stored."""
     group, size = tag.group, tag.size
+    verdict, reason = explained(tag)
     return TagPose(
         group.tag_id,
         group.family,
@@ -37,29 +32,48 @@ def tag_pose(tag: SolvedTag) -> TagPose:
         tag.n_used,
         tag.rms_px,
         visit=group.visit,
-        verdict=judge(tag),
+        verdict=verdict,
         leave_one_out=leave_one_out(tag.sightings),
         size_from_map=(size.measured_m, size.measured_m * size.sigma) if size.sigma < SHOWN_SIZE_SHARE else None,
+        reason=reason,
     )
 
 
-def judge(tag: SolvedTag) -> Literal["pass", "warn", "fail"]:
-    """Judge a tag.
+Verdict = Literal["pass", "warn", "fail"]
 
-    Fail: no two photos agree, its size contradicts the map by more than 3 %, or every photo of it is rejected at its
-    other tags. Warn: a reader should look at the
-    photos, since few are used, many rejected, the tilt is open, or the pose is uncertain or depends on one photo.
-    """
-    used, count = tag.n_used, len(tag.sightings)
+
+def judge(tag: SolvedTag) -> Verdict:
+    """Judge a tag; see `TagBounds`."""
+    return explained(tag)[0]
+
+
+def explained(tag: SolvedTag) -> tuple[Verdict, str]:
+    """Judge a tag, and say what a verdict other than pass rests on."""
+    bounds, used, count = TAG_BOUNDS, tag.n_used, len(tag.sightings)
     off = abs(math.log(tag.size.measured_m / tag.group.size_m))
-    doubted = all(s.is_contradicted for s in tag.sightings if s.used)
-    if (used == 1 and count > 1) or (tag.size.is_wrong and off > FAIL_SIZE_SHARE) or doubted:
-        return "fail"
+    fails: list[str] = []
+    warns: list[str] = []
+    if used == 1 and count > 1:
+        fails.append(f"no two of its {count} photos agree")
+    if all(s.is_contradicted for s in tag.sightings if s.used):
+        fails.append("its photos are rejected at every other tag that they show")
+    if tag.size.is_wrong:
+        words = f"the map's scale shows an edge of {tag.size.measured_m:.4g} m, {100 * off:.2g} % off"
+        (fails if off > bounds.fail_size_share else warns).append(words)
+    if count == 1:
+        warns.append("one photo only: nothing tells whether it is right")
+    elif 1 < used < bounds.enough_photos:
+        warns.append(f"{used} photos only: they cannot outvote a wrong one")
+    if count - used > bounds.rejected_share * count:
+        warns.append(f"{count - used} of {count} photos are rejected")
+    if not tag.group.fix.is_certain:
+        warns.append("its tilt is open: the photos do not decide between two")
     sigma = np.sqrt(np.diag(tag.covariance))
-    doubtful = used < ENOUGH_PHOTOS or 3 * (count - used) > count or not tag.group.fix.is_certain or tag.size.is_wrong
-    if doubtful or float(sigma[3:].max()) > WARN_SIGMA_M or float(sigma[:3].max()) > WARN_SIGMA_RAD:
-        return "warn"
-    return "pass"
+    if float(sigma[3:].max()) > bounds.warn_sigma_m:
+        warns.append(f"its position is known to {1e3 * float(sigma[3:].max()):.0f} mm only")
+    if float(sigma[:3].max()) > bounds.warn_sigma_rad:
+        warns.append(f"its rotation is known to {math.degrees(float(sigma[:3].max())):.1f} deg only")
+    return "fail" if fails else "warn" if warns else "pass", "; ".join(fails + warns)
 
 
 def leave_one_out(sightings: Sequence[SolvedSighting]) -> tuple[float, float] | None:
@@ -83,6 +97,10 @@ def photo_verdicts(solved: Solved, photos: Sequence[LocatedPhoto]) -> list[TagPh
                     ambiguity=s.sighted.solution.ambiguity,
                     sigma=s.sigmas,
                     flipped=s.flipped,
+                    rms_px=None if np.isnan(s.residual_px).any() else float(np.sqrt(np.mean(s.residual_px**2))),
+                    position_m=_position(s),
+                    offset=s.offset,
+                    without=s.without,
                 )
             )
     for h in solved.homeless:
@@ -90,6 +108,13 @@ def photo_verdicts(solved: Solved, photos: Sequence[LocatedPhoto]) -> list[TagPh
         file = photos[h.sighted.photo].file
         verdicts.append(TagPhoto(file, h.sighted.sighting.detection.id, used=False, reason=reason))
     return verdicts
+
+
+def _position(sighting: SolvedSighting) -> tuple[float, float, float]:
+    """Return where a photo by itself has the tag in the map."""
+    sighted = sighting.sighted
+    x, y, z = (sighted.sighting.ref_from_cam * sighted.solution.cam_from_tag).translation
+    return float(x), float(y), float(z)
 
 
 def explain(sighting: SolvedSighting) -> str:
@@ -106,7 +131,7 @@ def explain(sighting: SolvedSighting) -> str:
 def warn(tags: Sequence[SolvedTag], photos: Sequence[TagPhoto]) -> None:
     """Log what a reader should look at."""
     for tag in tags:
-        group, size, verdict = tag.group, tag.size, judge(tag)
+        group, size, (verdict, reason) = tag.group, tag.size, explained(tag)
         where = "" if group.visit is None else f" of visit {group.visit}"
         if size.is_wrong:
             log.warning(
@@ -115,9 +140,7 @@ def warn(tags: Sequence[SolvedTag], photos: Sequence[TagPhoto]) -> None:
                 group.tag_id, where, size.measured_m, size.measured_m * size.sigma, group.size_m,
             )  # fmt: skip
         if verdict != "pass":
-            log.warning("tag %d%s: %s (%d photos used)", group.tag_id, where, verdict, tag.n_used)
-        if len(tag.sightings) == 1:
-            log.warning("tag %d%s: one photo only: nothing tells whether it is right", group.tag_id, where)
+            log.warning("tag %d%s: %s: %s", group.tag_id, where, verdict, reason)
     known = {t.group.tag_id for t in tags}
     for tag_id in sorted({p.tag_id for p in photos if p.tag_id >= 0} - known):
         reasons = sorted({p.reason for p in photos if p.tag_id == tag_id})

@@ -125,7 +125,7 @@ def refine_arm(check: ArmCheck, *, what: Literal["camera", "hand"]) -> Refined:
 
 
 def _what_shows(fit: SweepFit) -> tuple[frozenset[int], Array]:
-    """Fix what of the camera does not show, the least of it first, until the rest does; return what, and the covariance.
+    """Fix what of the camera does not show, the least of it first; return what that is, and the covariance then.
 
     With a value fixed the others' covariance is the conditional one.
     """

@@ -68,7 +68,7 @@ def curve_svg(run: Run, part: Literal["position", "rotation"], *, name: str) -> 
         _plain_ticks(axes, low, high)
         axes.grid(axis="y", color="#edf0f3", linewidth=0.8)
         axes.spines[["top", "right"]].set_visible(False)
-        return _svg(figure, name=name, label=f"Cumulative {part} error per policy")
+        return svg_text(figure, name=name, label=f"Cumulative {part} error per policy")
 
 
 def _plain_ticks(axes: Axes, low: float, high: float) -> None:
@@ -105,7 +105,7 @@ def plan_svg(run: Run, visits: Sequence[VisitRows], *, name: str) -> str:
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x in the map (m)", ylabel="y in the map (m)")
         axes.set_aspect("equal")
         axes.spines[["top", "right"]].set_visible(False)
-        return _svg(figure, name=name, label="Map from above with waypoints and chosen directions")
+        return svg_text(figure, name=name, label="Map from above with waypoints and chosen directions")
 
 
 def _positions(visit: VisitRows) -> list[Array]:
@@ -208,7 +208,8 @@ def _chosen_views(visit: VisitRows, order: Sequence[str]) -> dict[str, list[Tria
     return views
 
 
-def _svg(figure: Figure, *, name: str, label: str) -> str:
+def svg_text(figure: Figure, *, name: str, label: str) -> str:
+    """Return a figure as SVG whose ids begin with a name, without what differs from run to run."""
     stream = io.StringIO()
     figure.savefig(stream, format="svg", dpi=200, metadata={"Date": None})
     text = stream.getvalue()

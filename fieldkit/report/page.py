@@ -17,6 +17,7 @@ from fieldkit import protocol as protocols
 from fieldkit.protocol import Threshold
 from fieldkit.report import figures
 from fieldkit.report.palette import Style, style
+from fieldkit.report.tags import TagSection, tag_section
 from fieldkit.report.visits import VisitRows, visit_rows
 from fieldkit.scores import (
     BEST_POSSIBLE,
@@ -112,6 +113,7 @@ class Chapter:
     curves: tuple[Markup, ...]
     plan: Markup | None
     waypoints: tuple[Waypoint, ...]
+    tags: TagSection | None
     excluded: tuple[tuple[str, str], ...]
 
 
@@ -144,6 +146,7 @@ def chapter(run: Run, number: int) -> Chapter:
         curves=curves,
         plan=Markup(figures.plan_svg(run, visits, name=f"{anchor}m")) if visits and _one_map(run) else None,
         waypoints=tuple(_waypoint(run, visit, f"{anchor}w{i}") for i, visit in enumerate(visits)),
+        tags=None if run.tags is None else tag_section(run.tags, name=f"{anchor}t"),
         excluded=tuple((e.what, e.reason) for e in run.excluded),
     )
 

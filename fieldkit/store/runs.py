@@ -17,7 +17,7 @@ from fieldkit import protocol as protocols
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, StoreError
 from fieldkit.frames import Pose, pose
-from fieldkit.store.files import atomic_folder, atomic_write, plain_json, read_json, saving
+from fieldkit.store.files import atomic_folder, atomic_write, digest, plain_json, read_json, saving
 from fieldkit.store.inputs import write_tum
 from fieldkit.store.tables import (
     COVARIANCE,
@@ -32,6 +32,7 @@ from fieldkit.store.tables import (
     read_table,
     write_table,
 )
+from fieldkit.store.tags import read_tags, write_tags
 from fieldkit.types import (
     VIEW_KINDS,
     Candidates,
@@ -47,6 +48,7 @@ from fieldkit.types import (
     VisitPlan,
 )
 
+TAGS_FILE = "tags.toml"
 TRIALS = (
     "session", "visit", "policy", "occlusion", "view", "weight", "utility", "status", "cam_position_m",
     "cam_rotation_deg", "body_position_m", "body_rotation_deg", "truth_sigma_m", "truth_sigma_deg", "prior_error_m",
@@ -94,6 +96,7 @@ def write_run(path: Path, run: Run, *, force: bool = False) -> None:
         write_table(folder / "candidates.csv", CANDIDATES, (row for p in run.plans for row in _candidate_cells(p)))
         _write_arrays(folder, run)
         _write_poses(folder, run)
+        _write_tags(folder, run)
         for key, jpeg in run.thumbnails.items():
             atomic_write(folder / "thumbs" / f"{quote(key, safe='')}.jpg", jpeg)
         atomic_write(folder / "run.json", plain_json(head))
@@ -126,7 +129,19 @@ def read_run(path: Path) -> Run:
         thumbnails={unquote(p.stem): p.read_bytes() for p in sorted((path / "thumbs").glob("*.jpg"))},
         excluded=tuple(head.excluded),
         path=str(path),
+        tags=read_tags(path / TAGS_FILE) if (path / TAGS_FILE).is_file() else None,
     )
+
+
+def _write_tags(folder: Path, run: Run) -> None:
+    """Put the tags beside the run, byte for byte where their file is still the one that was read."""
+    if run.tags is None:
+        return
+    source = Path(run.tags.path) if run.tags.path else None
+    if source is not None and source.is_file() and digest(source) == run.tags.digest:
+        atomic_write(folder / TAGS_FILE, source.read_bytes())
+    else:
+        write_tags(folder / TAGS_FILE, run.tags)
 
 
 def _check_complete(

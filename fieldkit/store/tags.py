@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from fieldkit.errors import FieldkitError, StoreError
-from fieldkit.frames import pose, position_quaternion
+from fieldkit.frames import Array, pose, position_quaternion
 from fieldkit.store.files import digest, read_toml, write_toml
 from fieldkit.types import TagMap, TagPhoto, TagPose
 
@@ -30,6 +30,7 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     leave_one_out_deg: float | None = None
     size_from_map_m: float | None = None
     size_sigma_m: float | None = None
+    reason: str | None = None
 
 
 class _Photo(msgspec.Struct, forbid_unknown_fields=True):
@@ -41,6 +42,12 @@ class _Photo(msgspec.Struct, forbid_unknown_fields=True):
     sigma: float
     visit: str | None = None
     flipped: bool = False
+    rms_px: float | None = None
+    position_m: tuple[float, float, float] | None = None
+    offset_m: float | None = None
+    offset_deg: float | None = None
+    without_m: float | None = None
+    without_deg: float | None = None
 
 
 class _TagsFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -65,25 +72,59 @@ def read_tags(path: Path) -> TagMap:
     keys = [(t.id, t.visit) for t in tags]
     if len(set(keys)) != len(keys):
         raise StoreError(f"{path}: a tag is listed twice for the same visit", hint="keep one [[tag]] per id and visit")
-    photos = tuple(
-        TagPhoto(p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma, p.flipped) for p in data.photo
+    return TagMap(
+        tuple(tags), tuple(_photo(p) for p in data.photo), data.map_digest, digest=digest(path), path=str(path)
     )
-    return TagMap(tuple(tags), photos, data.map_digest, digest=digest(path), path=str(path))
 
 
 def _tag(entry: _Tag) -> TagPose:
     if len(entry.covariance) != 36:
         raise StoreError(f"covariance has {len(entry.covariance)} numbers; expected 36, row-major")
     covariance = np.asarray(entry.covariance).reshape(6, 6)
-    if not np.isfinite(covariance).all() or np.linalg.eigvalsh((covariance + covariance.T) / 2).min() < -1e-12:
-        raise StoreError("covariance is not positive semi-definite")
-    spread, size = (entry.leave_one_out_m, entry.leave_one_out_deg), (entry.size_from_map_m, entry.size_sigma_m)
+    _check_covariance(covariance)
+    size = entry.size_from_map_m, entry.size_sigma_m
     map_from_tag = pose(entry.position_m, entry.quaternion_xyzw)
     return TagPose(
         entry.id, entry.family, entry.size_m, map_from_tag, covariance, entry.n_photos, entry.rms_px,
         visit=entry.visit, verdict=entry.verdict,
-        leave_one_out=None if spread[0] is None or spread[1] is None else (spread[0], math.radians(spread[1])),
+        leave_one_out=_in_rad(entry.leave_one_out_m, entry.leave_one_out_deg),
         size_from_map=None if size[0] is None or size[1] is None else (size[0], size[1]),
+        reason=entry.reason or "",
+    )  # fmt: skip
+
+
+def _check_covariance(covariance: Array) -> None:
+    """Raise StoreError unless a 6x6 covariance is finite, symmetric and has no negative direction.
+
+    All zeros are a tag that is known exactly.
+    """
+    largest = float(np.abs(covariance).max()) if np.isfinite(covariance).all() else math.inf
+    if not math.isfinite(largest):
+        raise StoreError("covariance is not finite")
+    if float(np.abs(covariance - covariance.T).max()) > 1e-6 * largest:
+        raise StoreError("covariance is not symmetric; expected 36 numbers, row-major, rotation before translation")
+    # Rotation (rad) and translation (m) differ by orders: each is measured by itself
+    scale = np.sqrt(np.abs(np.diag(covariance)))
+    unit = np.where(scale > 0, scale, 1.0)
+    lowest = float(np.linalg.eigvalsh((covariance + covariance.T) / 2 / np.outer(unit, unit)).min())
+    if lowest < -1e-6 or (np.diag(covariance) < 0).any():
+        raise StoreError(
+            f"covariance is not positive definite (it has a variance of {lowest:.2g} along a direction, diagonal 1)"
+        )
+
+
+def _in_rad(metres: float | None, degrees: float | None) -> tuple[float, float] | None:
+    return None if metres is None or degrees is None else (metres, math.radians(degrees))
+
+
+def _in_degrees(both: tuple[float, float] | None) -> tuple[float | None, float | None]:
+    return (None, None) if both is None else (both[0], math.degrees(both[1]))
+
+
+def _photo(p: _Photo) -> TagPhoto:
+    return TagPhoto(
+        p.file, p.tag_id, p.used, p.reason, p.visit, p.ambiguity, p.sigma, p.flipped, p.rms_px, p.position_m,
+        _in_rad(p.offset_m, p.offset_deg), _in_rad(p.without_m, p.without_deg),
     )  # fmt: skip
 
 
@@ -93,21 +134,19 @@ def write_tags(path: Path, tags: TagMap) -> None:
     for t in tags.tags:
         xyz, quaternion = position_quaternion(t.map_from_tag)
         covariance = [float(v) for v in np.asarray(t.covariance).ravel()]
+        spread, size = _in_degrees(t.leave_one_out), t.size_from_map or (None, None)
         entries.append(
             _Tag(
-                t.id,
-                t.family,
-                t.size_m,
-                xyz,
-                quaternion,
-                covariance,
-                t.n_photos,
-                t.rms_px,
-                t.verdict,
-                t.visit,
-                *((None, None) if t.leave_one_out is None else (t.leave_one_out[0], math.degrees(t.leave_one_out[1]))),
-                *(t.size_from_map or (None, None)),
+                t.id, t.family, t.size_m, xyz, quaternion, covariance, t.n_photos, t.rms_px, t.verdict, t.visit,
+                leave_one_out_m=spread[0], leave_one_out_deg=spread[1],
+                size_from_map_m=size[0], size_sigma_m=size[1], reason=t.reason or None,
             )
+        )  # fmt: skip
+    photos = [
+        _Photo(
+            p.file, p.tag_id, p.used, p.reason, p.ambiguity, p.sigma, p.visit, p.flipped, p.rms_px, p.position_m,
+            *_in_degrees(p.offset), *_in_degrees(p.without),
         )
-    photos = [_Photo(p.file, p.tag_id, p.used, p.reason, p.ambiguity, p.sigma, p.visit, p.flipped) for p in tags.photos]
+        for p in tags.photos
+    ]  # fmt: skip
     write_toml(path, _TagsFile(1, tags.map_digest, entries, photos))

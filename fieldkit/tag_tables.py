@@ -1,0 +1,117 @@
+"""Calibrated tags as a table and as JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+
+from fieldkit.console import cells, make_table
+from fieldkit.frames import Array
+from fieldkit.types import TAG_BOUNDS, TagMap, TagPhoto, TagPose
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def print_tags(tags: TagMap) -> None:
+    """Print every tag with its diagnostics, and what the verdicts mean."""
+    console = Console(width=max(140, Console().width))
+    console.print(_table(tags))
+    bounds = TAG_BOUNDS
+    known = f"{1e3 * bounds.warn_sigma_m:g} mm and {math.degrees(bounds.warn_sigma_rad):g} deg"
+    console.print(
+        f"pass: at least {bounds.enough_photos} photos agree, at most a third is rejected, and a standard deviation "
+        f"per axis is at most {known}; fail: no two photos agree, or the size is {100 * bounds.fail_size_share:g} % "
+        "off; warn: everything between",
+        markup=False,
+    )
+
+
+def _table(tags: TagMap) -> Table:
+    table = make_table(
+        "tag", "visit", "photos", "rms px", "sigma mm", "sigma deg", "spread mm", "without one", "size from map",
+        "verdict", "why",
+    )  # fmt: skip
+    for t in tags.tags:
+        own = _photos(tags, t)
+        position, rotation = sigmas(t.covariance)
+        spread = [p.offset[0] for p in own if p.used and p.offset is not None]
+        without = t.leave_one_out
+        row: list[object] = [
+            t.id,
+            t.visit or "-",
+            f"{t.n_photos} of {max(len(own), t.n_photos)}",
+            f"{t.rms_px:.2f}",
+            f"{1e3 * position:.2f}",
+            f"{rotation:.3f}",
+            f"{1e3 * float(np.median(spread)):.1f}" if spread else "-",
+            "-" if without is None else f"{1e3 * without[0]:.1f} mm {math.degrees(without[1]):.2f} deg",
+            "-" if t.size_from_map is None else f"{t.size_from_map[0]:.4f} +- {t.size_from_map[1]:.4f}",
+            t.verdict,
+            t.reason or "-",
+        ]
+        table.add_row(*cells(row))
+    return table
+
+
+def _photos(tags: TagMap, tag: TagPose) -> list[TagPhoto]:
+    return [p for p in tags.photos if (p.tag_id, p.visit) == (tag.id, tag.visit)] or [
+        p for p in tags.photos if p.tag_id == tag.id and tag.visit is None
+    ]
+
+
+def tags_json(tags: TagMap) -> dict[str, Any]:
+    """Return tags and photos as plain values; None where nothing tells."""
+    return {
+        "version": 1,
+        "map_digest": tags.map_digest,
+        "tags": [_tag_json(t) for t in tags.tags],
+        "photos": [_photo_json(p) for p in tags.photos],
+    }
+
+
+def _tag_json(t: TagPose) -> dict[str, Any]:
+    without, size = t.leave_one_out, t.size_from_map
+    return {
+        "id": t.id,
+        "visit": t.visit,
+        "position_m": t.map_from_tag.translation,
+        "quaternion_xyzw": t.map_from_tag.rotation.as_quat(),
+        "covariance": t.covariance.ravel(),
+        "n_photos": t.n_photos,
+        "rms_px": t.rms_px,
+        "verdict": t.verdict,
+        "reason": t.reason,
+        "size_m": t.size_m,
+        "leave_one_out_m": None if without is None else without[0],
+        "leave_one_out_deg": None if without is None else math.degrees(without[1]),
+        "size_from_map_m": None if size is None else size[0],
+        "size_sigma_m": None if size is None else size[1],
+    }
+
+
+def _photo_json(p: TagPhoto) -> dict[str, Any]:
+    return {
+        "file": p.file,
+        "tag_id": p.tag_id,
+        "visit": p.visit,
+        "used": p.used,
+        "reason": p.reason,
+        "ambiguity": p.ambiguity,
+        "sigma": p.sigma,
+        "flipped": p.flipped,
+        "rms_px": p.rms_px,
+        "position_m": p.position_m,
+        "offset_m": None if p.offset is None else p.offset[0],
+        "offset_deg": None if p.offset is None else math.degrees(p.offset[1]),
+        "without_m": None if p.without is None else p.without[0],
+        "without_deg": None if p.without is None else math.degrees(p.without[1]),
+    }
+
+
+def sigmas(covariance: Array) -> tuple[float, float]:
+    """Return the standard deviations of position (m) and rotation (deg) of a 6x6 covariance."""
+    return float(np.sqrt(np.trace(covariance[3:, 3:]))), float(np.degrees(np.sqrt(np.trace(covariance[:3, :3]))))
