@@ -254,6 +254,7 @@ def test_two_photos_that_disagree_fail_the_tag(wall_photos: Wall, tmp_path: Path
     folder = listed(wall_photos, tmp_path / "p", [("a0.png", None), ("moved.png", None)])
     (tag,) = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M}).tags
     assert (tag.n_photos, tag.verdict) == (1, "fail")
+    assert tag.reason.startswith("no two of its 2 photos agree")
 
 
 def test_what_is_wrong_with_the_photos_is_named(wall_photos: Wall, tmp_path: Path) -> None:

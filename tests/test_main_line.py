@@ -192,6 +192,12 @@ def test_scores_and_report_need_no_image_bag_or_map(tmp_path: Path, run_folder: 
     assert [p["name"] for p in written["policies"]][:3] == ["stowed", "forward", "odometry"]
 
 
+def test_the_run_keeps_the_tags_that_it_rests_on_byte_for_byte(run_folder: Path, run: Run) -> None:
+    assert (run_folder / "tags.toml").read_bytes() == (SAMPLE / "tags.toml").read_bytes()
+    assert run.tags is not None
+    assert run.tags.digest == run.tags_digest
+
+
 def test_localizing_is_independent_of_what_was_localized_before() -> None:
     recording = open_recording(SAMPLE / "session")
     frames = [v.frame for v in recording.visits[0].views[1:3]]

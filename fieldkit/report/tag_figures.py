@@ -53,16 +53,22 @@ def _reach(covariance: Array, used: Sequence[Array]) -> float:
     return 1.15 * max(wide, far)
 
 
+def two_sigma(covariance: Array) -> tuple[float, float, float]:
+    """Return the long and the short diameter of the 2 sigma ellipse of a 2x2 covariance, and its turn in deg."""
+    values, vectors = np.linalg.eigh(covariance)
+    short, long = 4 * np.sqrt(np.maximum(values, 0.0))
+    return float(long), float(short), math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+
+
 def _draw(
     axes: Axes, onto: Array, covariance: Array, turn: Array, seen: Sequence[tuple[bool, Array]], reach: float
 ) -> None:
     """Draw onto the plane of two rows (2, 3); everything in mm about the tag's centre."""
-    across = onto @ turn[:, 0]
-    if float(np.linalg.norm(across)) > 0.3:
+    # The paper is seen edge on along the axis of it that lies in the picture
+    across = max((onto @ turn[:, 0], onto @ turn[:, 1]), key=lambda axis: float(np.linalg.norm(axis)))
+    if float(np.linalg.norm(onto @ turn[:, 2])) > 0.5:
         axes.plot(*(np.outer(across, [-2 * reach, 2 * reach])), color=PALE, linewidth=3.0, alpha=0.5, zorder=1)
-    values, vectors = np.linalg.eigh(onto @ covariance @ onto.T)
-    wide, high = 4 * np.sqrt(np.maximum(values[::-1], 0.0))
-    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+    wide, high, angle = two_sigma(onto @ covariance @ onto.T)
     axes.add_patch(Ellipse((0.0, 0.0), wide, high, angle=angle, facecolor=GOOD, alpha=0.18, edgecolor="none", zorder=2))
     axes.add_patch(Ellipse((0.0, 0.0), wide, high, angle=angle, fill=False, edgecolor=GOOD, linewidth=1.4, zorder=3))
     axes.plot(0.0, 0.0, marker="+", markersize=9, color=INK, zorder=5)

@@ -75,8 +75,8 @@ def _bounds() -> tuple[tuple[str, str], ...]:
         (
             "pass",
             f"at least {b.enough_photos} photos agree, at most {100 * b.rejected_share:.0f} % are rejected, the "
-            f"largest standard deviation along an axis is at most {1e3 * b.warn_sigma_m:g} mm and {degrees:g}°, the tilt is "
-            "certain, and the size agrees with the map",
+            f"largest standard deviation along an axis is at most {1e3 * b.warn_sigma_m:g} mm and {degrees:g}°, the "
+            "tilt is certain, and the size agrees with the map",
         ),
         ("warn", "one of these does not hold: look at the photos, take more, or measure the tag"),
         (
