@@ -19,7 +19,7 @@ from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
-from fieldkit.tag_tables import print_tags, tags_json
+from fieldkit.tag_tables import print_second, print_tags, second_json, tags_json
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
 
@@ -101,6 +101,7 @@ def tags_calibrate(
     out: Path,
     size_m: Repeated[tuple[str, ...]],
     camera: Path | None = None,
+    check_map: Path | None = None,
     json: bool = False,
     force: bool = False,
 ) -> None:
@@ -112,20 +113,26 @@ def tags_calibrate(
         out: tags.toml to write
         size_m: edge length of the black square in m, or ID:SIZE for one tag; may be repeated
         camera: camera.toml of the photos, where photos.toml names none
+        check_map: another map of the place, such as one of another feature: compare where it localizes the photos
         json: print JSON
         force: replace an existing file
     """
     from fieldkit import store
-    from fieldkit.calibrate import calibrate_tags, parse_sizes
+    from fieldkit.calibrate import calibrate_tags, check_in_second_map, parse_sizes
 
     store.refuse_existing(out, force=force, kind="file")
+    sizes_m, second = parse_sizes(size_m), None
     with ProgressBars() as progress:
-        tags = calibrate_tags(photos, map, camera=camera, sizes_m=parse_sizes(size_m), progress=progress)
-    store.write_tags(out, tags)
+        tags = calibrate_tags(photos, map, camera=camera, sizes_m=sizes_m, progress=progress)
+        store.write_tags(out, tags)
+        if check_map is not None:
+            second = check_in_second_map(photos, map, check_map, camera=camera, sizes_m=sizes_m, progress=progress)
     if json:
-        print_json(tags_json(tags))
+        print_json(tags_json(tags) | ({} if second is None else {"second_map": second_json(second)}))
         return
     print_tags(tags)
+    if second is not None:
+        print_second(second)
     for photo in tags.photos:
         if not photo.used:
             logging.getLogger(__name__).warning("%s: not used: %s", photo.file, photo.reason)

@@ -15,6 +15,8 @@ from fieldkit.types import TAG_BOUNDS, TagMap, TagPhoto, TagPose
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from fieldkit.calibrate.second import SecondLook
+
 
 def print_tags(tags: TagMap) -> None:
     """Print every tag with its diagnostics, and what the verdicts mean."""
@@ -109,6 +111,50 @@ def _photo_json(p: TagPhoto) -> dict[str, Any]:
         "offset_deg": None if p.offset is None else math.degrees(p.offset[1]),
         "without_m": None if p.without is None else p.without[0],
         "without_deg": None if p.without is None else math.degrees(p.without[1]),
+    }
+
+
+def print_second(look: SecondLook) -> None:
+    """Print how photos in a second map differ from those in the first."""
+    title = f"photos in a map of {look.features[1]} against the map of {look.features[0]}"
+    table = make_table("photo", "difference mm", "difference deg", "sigmas", "verdict", title=title)
+    for p in look.photos:
+        numbers = [f"{1e3 * p.position_m:.1f}", f"{math.degrees(p.rotation_rad):.3f}", f"{p.sigmas:.1f}"]
+        table.add_row(*cells([p.file, *numbers, "agrees" if p.agrees else "contradicts"]))
+    for file, where in look.lost:
+        table.add_row(*cells([file, "-", "-", "-", f"not localized in {where}"]))
+    console = Console(width=max(120, Console().width))
+    console.print(table)
+    console.print(
+        f"between the maps: {1e3 * look.offset[0]:.1f} mm, {math.degrees(look.offset[1]):.3f} deg, scale "
+        f"{100 * look.scale[0]:+.2f} % (sigma {100 * look.scale[1]:.2f} %); what remains is {look.spread:.1f} times "
+        f"the stated sigma: {look.verdict}",
+        markup=False,
+    )
+
+
+def second_json(look: SecondLook) -> dict[str, Any]:
+    """Return a second look at photos as plain values."""
+    photos = [
+        {
+            "file": p.file,
+            "position_m": p.position_m,
+            "rotation_deg": math.degrees(p.rotation_rad),
+            "sigmas": p.sigmas,
+            "agrees": p.agrees,
+        }
+        for p in look.photos
+    ]
+    return {
+        "features": list(look.features),
+        "verdict": look.verdict,
+        "spread": look.spread,
+        "offset_m": look.offset[0],
+        "offset_deg": math.degrees(look.offset[1]),
+        "scale_percent": 100 * look.scale[0],
+        "scale_sigma_percent": 100 * look.scale[1],
+        "photos": photos,
+        "lost": [{"file": file, "map": where} for file, where in look.lost],
     }
 
 

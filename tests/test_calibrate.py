@@ -65,10 +65,10 @@ def looking_at_wall(x: float, y: float, distance: float, yaw_deg: float = 0.0, p
     return MAP_FROM_WALL * facing * Pose.from_rotation(Rotation.from_euler("x", 180, degrees=True))
 
 
-def build(texture: Image, rng: np.random.Generator) -> SceneMap:
+def build(texture: Image, rng: np.random.Generator, *, feature: str = "sift") -> SceneMap:
     """Make a map from one image of the wall: its keypoints, back-projected onto the wall, are the landmarks."""
     map_from_cam = looking_at_wall(0.0, 0.0, 1.7)
-    features = extract(photograph(texture, MAPPING, map_from_cam, rng), feature="sift", max_keypoints=2000)
+    features = extract(photograph(texture, MAPPING, map_from_cam, rng), feature=feature, max_keypoints=2000)
     rays = map_from_cam.rotation.apply(MAPPING.unproject(features.keypoints_px))
     normal = MAP_FROM_WALL.rotation.apply([0.0, 0.0, 1.0])
     depth = (MAP_FROM_WALL.translation - map_from_cam.translation) @ normal / (rays @ normal)
@@ -76,7 +76,7 @@ def build(texture: Image, rng: np.random.Generator) -> SceneMap:
     n = len(xyz)
     zeros, every = np.zeros(n, np.int32), np.arange(n, dtype=np.int32)
     return SceneMap(
-        "wall.map", "digest", "sift", xyz, np.tile(np.eye(3) * 1e-6, (n, 1, 1)), ("0.jpg",), (MAPPING,),
+        "wall.map", "digest", feature, xyz, np.tile(np.eye(3) * 1e-6, (n, 1, 1)), ("0.jpg",), (MAPPING,),
         (map_from_cam,), every, zeros, features.keypoints_px.astype(np.float32), features.descriptors, every, zeros,
     )  # fmt: skip
 

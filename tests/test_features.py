@@ -26,9 +26,10 @@ def texture(rng: np.random.Generator, size: tuple[int, int] = (320, 240)) -> np.
     return np.clip(127 + 60 * smooth / smooth.std(), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.parametrize("feature", list(FEATURES))
 @pytest.mark.parametrize("centre", [(50.5, 40.5), (51.0, 40.75), (60.3, 44.1)])
-def test_a_spot_is_found_at_its_centre_in_colmap_pixels(centre: tuple[float, float]) -> None:
-    found = extract(blob(*centre))
+def test_a_spot_is_found_at_its_centre_in_colmap_pixels(centre: tuple[float, float], feature: str) -> None:
+    found = extract(blob(*centre), feature=feature)
     assert len(found) > 0
     np.testing.assert_allclose(found.keypoints_px.mean(axis=0), centre, atol=0.06)
 
@@ -55,6 +56,16 @@ def test_descriptors_are_eight_bit_and_of_length_512(rng: np.random.Generator) -
     assert found.descriptors.dtype == np.uint8
     assert found.descriptors.shape[1] == FEATURES["sift"].width
     np.testing.assert_allclose(np.linalg.norm(found.descriptors.astype(float), axis=1), 512, rtol=0.03)
+
+
+def test_akaze_s_descriptors_are_unit_vectors_and_repeat_exactly(rng: np.random.Generator) -> None:
+    image = texture(rng)
+    first, second = (extract(image, feature="akaze", max_keypoints=100) for _ in range(2))
+    assert first.descriptors.shape == (100, FEATURES["akaze"].width)
+    np.testing.assert_allclose(np.linalg.norm(first.descriptors, axis=1), 1.0, rtol=1e-5)
+    assert (np.diff(first.scores) <= 0).all()
+    np.testing.assert_array_equal(first.descriptors, second.descriptors)
+    assert len(extract(np.full((96, 128), 90, np.uint8), feature="akaze")) == 0
 
 
 def test_colour_is_reduced_to_grey(rng: np.random.Generator) -> None:

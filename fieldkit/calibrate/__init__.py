@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fieldkit.calibrate.locating import locate
 from fieldkit.calibrate.photos import Progress, find_tags, list_photos, parse_sizes
+from fieldkit.calibrate.second import check_in_second_map
 from fieldkit.calibrate.solving import solve_tags
 from fieldkit.calibrate.verdicts import photo_verdicts, tag_pose, warn
 from fieldkit.errors import TagError
@@ -14,7 +15,7 @@ from fieldkit.maps import load_map
 from fieldkit.protocol import LocalizerRules
 from fieldkit.types import SceneMap, TagMap
 
-__all__ = ["calibrate_photos", "calibrate_tags", "parse_sizes"]
+__all__ = ["calibrate_photos", "calibrate_tags", "check_in_second_map", "parse_sizes"]
 
 
 def calibrate_tags(

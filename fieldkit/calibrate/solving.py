@@ -124,7 +124,7 @@ def solve_tags(
 def _solve(
     photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array, sizes_m: Mapping[int | None, float]
 ) -> Solved:
-    fixed, _ = _landmarks(photos, xyz, covariance)
+    fixed, _ = place_photos(photos, xyz, covariance)
     poses = [fixed.centre.pose(i) for i in range(len(photos))]
     blocks = [fixed.camera_covariance(i) for i in range(len(photos))]
     groups, homeless = group(sight(photos, poses, blocks, sizes_m), sizes_m)
@@ -135,14 +135,14 @@ def _solve(
     start = problem.start(sizes.solved_m)
     agreed = agree(fixed, problem.corners, start, used=consensus, free_sizes=sizes.is_wrong)
     kept = np.unique(problem.corners.photo[agreed.adjusted.used])
-    alone, excess = _landmarks([photos[i] for i in kept], xyz, covariance)
+    alone, excess = place_photos([photos[i] for i in kept], xyz, covariance)
     final, corners, rows = _settle(problem, agreed, kept, alone, sizes.is_wrong)
     sightings = _sightings(problem, agreed, final, corners, rows)
     tags = [_tag(t, problem, final, sightings, [p.shared for p in photos], sizes.of(t)) for t in range(len(groups))]
     return Solved(tuple(tags), tuple(homeless), final.scale * math.sqrt(excess))
 
 
-def _landmarks(photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array) -> tuple[FixedLandmarks, float]:
+def place_photos(photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array) -> tuple[FixedLandmarks, float]:
     """Return what the landmarks say about the photos, and the factor of their variance that residuals show, from 1."""
     landmarks = Landmarks.of([(p.landmark, p.bearings) for p in photos], xyz, covariance)
     found = adjust_cameras(landmarks, Poses.of([p.map_from_cam for p in photos]))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import FeatureError, suggestion
+from fieldkit.features.akaze import detect_akaze
 from fieldkit.features.sift import detect_sift
 from fieldkit.types import Image
 
@@ -54,6 +55,7 @@ class FeatureKind:
 
 FEATURES: dict[str, FeatureKind] = {
     "sift": FeatureKind(detect_sift, 128, "ratio"),
+    "akaze": FeatureKind(detect_akaze, 64, "ratio"),
 }
 
 
