@@ -26,7 +26,7 @@ SIZES = {None: SIZE_M}
 
 @pytest.fixture(scope="module")
 def swept() -> Swept:
-    return sweep(3, poses=16)
+    return sweep(3, poses=13)
 
 
 @pytest.fixture(scope="module")
@@ -102,14 +102,14 @@ def test_recorded_detections_take_the_place_of_images(tmp_path: Path, swept: Swe
 
 
 def test_an_arm_that_stands_at_every_image_shows_no_latency(tmp_path: Path) -> None:
-    still = sweep(5, poses=12, moving=False)
+    still = sweep(5, poses=9, moving=False)
     check = check_arm(find_sweep(open_arm(write(tmp_path / "still.mcap", still)), SIZES))
     assert verdicts(check)["stamps late by"] == "unknown"
     assert verdicts(check)["rotation z"] == "pass"
 
 
 def test_a_hand_that_turns_about_one_axis_cannot_be_refined(tmp_path: Path) -> None:
-    flat = sweep(6, poses=10, turning=("sh0",))
+    flat = sweep(6, poses=7, turning=("sh0",))
     check = check_arm(find_sweep(open_arm(write(tmp_path / "flat.mcap", flat)), SIZES))
     assert "unknown" in {verdicts(check)[f"position {axis}"] for axis in "xyz"}
     with pytest.raises(
