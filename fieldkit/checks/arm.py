@@ -16,6 +16,8 @@ from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, exp
 
 SIGMAS = 3.0
+# An error of the tags' size that matters
+SIZE_PERCENT = 1.0
 FOCAL, CENTRE = 7, (9, 10)
 
 
@@ -87,6 +89,13 @@ def check_arm(sweep: Sweep, *, sigmas: float = SIGMAS) -> ArmCheck:
             verdict = "fail" if abs(deviation) > p.tolerance else "warn"
         f = p.factor
         findings.append(Finding(p.name, p.group, p.unit, f * deviation, f * sigma, f * p.tolerance, verdict))
+    size, sigma = (100 * v for v in fit.size)
+    told: Literal["pass", "warn", "fail", "unknown"] = "pass"
+    if sigma > SIZE_PERCENT:
+        told = "unknown"
+    elif abs(size) > sigmas * sigma:
+        told = "fail" if abs(size) > SIZE_PERCENT else "warn"
+    findings.append(Finding("size of the tags", "tags", "%", size, sigma, SIZE_PERCENT, told))
     return ArmCheck(sweep, fit, tuple(findings))
 
 

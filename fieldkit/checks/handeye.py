@@ -43,6 +43,7 @@ class SweepFit:
     """The solution: deviations from the stated values in the order of ``parameters``, and their covariance.
 
     ``values`` f64[p] and ``covariance`` f64[p, p] in rad, m, s, log and pixels. ``noise`` is what the residuals show.
+    ``size`` is by how much larger the tags are than stated, as a share, by the sweep alone, and its sigma.
     ``rms_px`` is the root mean square of the corners' residuals before anything is corrected and after, kinematics as
     they are.
     """
@@ -52,6 +53,7 @@ class SweepFit:
     covariance: Array
     noise: Noise
     used: Mask
+    size: tuple[float, float]
     rms_px: tuple[float, float]
 
     def sigma(self, index: int) -> float:
@@ -112,8 +114,15 @@ def _fit(problem: Problem, sweep: Sweep) -> SweepFit:
     covariance = np.zeros((count, count))
     covariance[np.ix_(problem.free[own], problem.free[own])] = inverse[np.ix_(inside, inside)]
     covariance[LATENCY, LATENCY] += (CHORD_INTERVALS * interval_s(sweep)) ** 2
+    size = _without_prior(float(state.values[-1]), float(inverse[-1, -1]), float(problem.prior[-1]) ** 2)
     old, new = (float(np.sqrt(np.mean(r[used] ** 2))) for r in (before, linear.residual))
-    return SweepFit(problem.parameters, state.values[:count], covariance, noise, used, (old, new))
+    return SweepFit(problem.parameters, state.values[:count], covariance, noise, used, size, (old, new))
+
+
+def _without_prior(value: float, variance: float, prior: float) -> tuple[float, float]:
+    """Return value and sigma of a number without what was known beforehand, as precision and mean add up."""
+    share = max(1.0 - variance / prior, 1e-6)
+    return value / share, math.sqrt(variance / share)
 
 
 def _start(problem: Problem, sweep: Sweep) -> State:

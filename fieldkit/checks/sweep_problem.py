@@ -27,7 +27,7 @@ HAND, LATENCY, CAMERA = slice(0, 6), 6, slice(7, 15)
 JOINT_SIGMA_RAD = math.radians(0.1)
 # Blur, averaged in light and then encoded, moves edges into the dark: by so many seconds of an image's motion, and so
 # many pixels in every image (standard deviations). A tag is measured to such a share of its size
-SHRINK_S, EDGE_PX, SIZE_SHARE = 0.005, 0.1, 0.002
+SHRINK_S, EDGE_PX, SIZE_SHARE = 0.005, 0.25, 0.002
 # The arm's path between two samples of tf is taken as straight; what that is off by looks like late stamps, by so many
 # intervals between samples
 CHORD_INTERVALS = 0.05
