@@ -208,7 +208,7 @@ def _prepare(recording: Recording, tags: TagMap, protocol: Protocol) -> tuple[di
     excluded: list[Excluded] = []
     for visit in recording.visits:
         try:
-            priors[visit.id] = estimate_prior(recording, visit, tags, noise=protocol.odometry)
+            priors[visit.id] = estimate_prior(recording, visit, tags, noise=protocol.odometry, arm=protocol.arm)
         except EXCLUDING as error:
             excluded.append(Excluded(f"{recording.name}/{visit.id}", str(error)))
     located = [v for v in recording.visits if v.id in priors]
@@ -216,7 +216,7 @@ def _prepare(recording: Recording, tags: TagMap, protocol: Protocol) -> tuple[di
     ahead = forward_directions(located, [priors[v.id] for v in located], rules=protocol.candidates)
     for visit, direction in zip(located, ahead, strict=True):
         try:
-            truths = estimate_truths(recording, visit, tags)
+            truths = estimate_truths(recording, visit, tags, noise=protocol.odometry, arm=protocol.arm)
             usable, dropped = _usable_views(recording, visit, truths)
             candidates = recorded_candidates(
                 recording, usable, priors[visit.id], rules=protocol.candidates, forward_in_map=direction
