@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from fieldkit.errors import ScoreError, suggestion
 from fieldkit.frames import Pose, pose_error
 from fieldkit.protocol import Protocol, Threshold
-from fieldkit.trust import BEST_POSSIBLE, open_shares, open_words, trust, trust_dict, truths_of
+from fieldkit.trust import BEST_POSSIBLE as BEST_POSSIBLE
+from fieldkit.trust import open_shares, open_words, trust, trust_dict, truths_of
 from fieldkit.types import Run, Trial, Truth, ViewResult, VisitPlan
 
 Array = NDArray[np.float64]

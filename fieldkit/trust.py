@@ -117,17 +117,17 @@ def trust(run: Run, *, thresholds: Sequence[Threshold] | None = None) -> TruthTr
     warning = ""
     if coarse:
         warning = (
-            f"the truth of {coarse} of {len(truths)} views is coarse: 2 sigma are up to {SIGMAS * largest[0]:.3g} m and "
+            f"the truth of {coarse} of {len(truths)} views is coarse: 2 sigma are up to {SIGMAS * largest[0]:.3g} m, "
             f"{math.degrees(SIGMAS * largest[1]):.3g} deg, over a third of the tightest threshold, {tight[0]:g} m / "
             f"{math.degrees(tight[1]):g} deg"
         )
     return TruthTrust(
-        (float(median[0]), float(median[1])),
-        (float(largest[0]), float(largest[1])),
-        len(truths),
-        coarse,
-        share,
-        warning,
+        median_sigma=(float(median[0]), float(median[1])),
+        max_sigma=(float(largest[0]), float(largest[1])),
+        n_views=len(truths),
+        n_coarse=coarse,
+        open_share=share,
+        warning=warning,
     )
 
 
@@ -141,7 +141,7 @@ def open_words(trusted: TruthTrust, thresholds: Sequence[Threshold]) -> str:
 
 
 def trust_dict(trusted: TruthTrust | None) -> dict[str, Any] | None:
-    """Return the values of `score --json` that tell how far the truth reaches: fractions, m and deg; None without truth."""
+    """Return the values of `score --json` about the truth: shares, m and deg; None without any."""
     if trusted is None:
         return None
     return {

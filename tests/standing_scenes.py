@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -27,8 +28,8 @@ _FACING = Rotation.from_matrix([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 class Settings:
     """What is simulated: noises as stated, and by how much the true ones differ."""
 
-    odometry: OdometryNoise = OdometryNoise()
-    arm: ArmNoise = ArmNoise()
+    odometry: OdometryNoise = dataclasses.field(default_factory=OdometryNoise)
+    arm: ArmNoise = dataclasses.field(default_factory=ArmNoise)
     corner_px: float = 0.2
     states_sigma: bool = True
     tag_m: float = 0.002
@@ -56,7 +57,7 @@ class Standing:
         return self.recording.visits[0]
 
 
-def stand(rng: np.random.Generator, settings: Settings = Settings()) -> Standing:
+def stand(rng: np.random.Generator, settings: Settings) -> Standing:
     """Draw a session: stand at the start tags, walk to a waypoint, look at its tripod tag and around."""
     s = settings
     start = yaw_pose([0.0, 0.0, 0.0], rng.uniform(-math.pi, math.pi))
@@ -83,7 +84,11 @@ def stand(rng: np.random.Generator, settings: Settings = Settings()) -> Standing
     for i in range(s.n_truth + s.n_blind):
         blind = i >= s.n_truth
         yaw = rng.uniform(0.8, 2 * math.pi - 0.8)
-        aim = Pose.from_rotation(Rotation.from_euler("z", yaw)) * Pose.from_components([0.4, 0, 0.6], _AXES) if blind else None
+        aim = (
+            Pose.from_rotation(Rotation.from_euler("z", yaw)) * Pose.from_components([0.4, 0, 0.6], _AXES)
+            if blind
+            else None
+        )
         at_visit.append(frame(round((21 + 0.4 * i) * SECOND), [tripod], aim))
     views = tuple(View(f"{i:02d}", "sweep", f) for i, f in enumerate(at_visit))
     visit = Visit("w01", 20 * SECOND, 40 * SECOND, views, truth_tag_id=99)
@@ -104,12 +109,13 @@ def _walk(rng: np.random.Generator, start: Pose, s: Settings) -> tuple[list[Pose
     times = np.arange(0, 42 * SECOND, SECOND // 10, dtype=np.int64)
     poses, bend = [start], rng.uniform(-0.5, 0.5)
     for t_ns in times[1:]:
-        moving = 10 * SECOND < t_ns <= 19 * SECOND
-        step = yaw_pose([s.walk_m / 90, 0, 0], bend * s.walk_m / 90) if moving else Pose.identity()
+        step = None
+        if s.walk_m and 10 * SECOND < t_ns <= 19 * SECOND:
+            step = yaw_pose([s.walk_m / 90, 0, 0], bend * s.walk_m / 90)
         if s.step_m and abs(int(t_ns) - 25 * SECOND) < SECOND // 20:
             angle = rng.uniform(-math.pi, math.pi)
             step = yaw_pose([s.step_m * math.cos(angle), s.step_m * math.sin(angle), 0], rng.normal(0, s.step_m))
-        poses.append(poses[-1] * step)
+        poses.append(poses[-1] if step is None else poses[-1] * step)
     return poses, times
 
 
@@ -118,10 +124,15 @@ def _believed(rng: np.random.Generator, true: list[Pose], noise: OdometryNoise) 
     yaw_m, yaw_turn = math.radians(noise.yaw_deg_per_m) * rng.normal(), noise.yaw_deg_per_turn_deg * rng.normal()
     drift = noise.position_per_m * rng.normal(size=3)
     poses = [Pose.from_components(rng.uniform(-20, 20, 3), Rotation.from_euler("z", rng.uniform(-3, 3)))]
-    for before, after in zip(true, true[1:], strict=False):
+    for before, after in itertools.pairwise(true):
+        if after is before:
+            poses.append(poses[-1])
+            continue
         moved = before.inv() * after
         length, turn = float(np.linalg.norm(moved.translation)), float(moved.rotation.magnitude())
-        yaw = yaw_m * length + yaw_turn * turn + math.radians(noise.yaw_deg_per_root_m) * math.sqrt(length) * rng.normal()
+        yaw = (
+            yaw_m * length + yaw_turn * turn + math.radians(noise.yaw_deg_per_root_m) * math.sqrt(length) * rng.normal()
+        )
         shift = drift * length + noise.position_per_root_m * math.sqrt(length) * rng.normal(size=3)
         shifted = poses[-1] * moved * exp([0, 0, yaw, 0, 0, 0])
         poses.append(Pose.from_components(shifted.translation + shift, shifted.rotation))

@@ -27,6 +27,8 @@ from fieldkit.types import TagPose
 
 # Another tag joins in unless it contradicts the named one beyond one in ten thousand (6 degrees of freedom)
 AGREES = float(chi2_law.ppf(0.9999, 6))
+# How far from upright a body may well stand, and the tag be calibrated: the odds between planar solutions
+UPRIGHT_RAD = math.radians(2.0)
 # Residuals widen the covariance where they exceed their noise beyond one in a hundred
 WIDEN = 0.99
 
@@ -37,7 +39,8 @@ class BodyFix:
 
     ``covariance`` is that of map_from_body. ``joint`` is that of the unknowns: map_from_body as the cameras see it, the
     shared error of the camera, the steps. ``scale`` multiplies the arm's stated noise per image, ``used`` counts the
-    sightings per tag id, ``left_out`` names tags that contradict the named one, ``rms_px`` is what remains.
+    sightings per tag id, ``left_out`` names tags that contradict the named one, ``rms_sigma`` is
+    the root mean square of what remains, in standard deviations.
     """
 
     t_ns: int
@@ -50,7 +53,7 @@ class BodyFix:
     scale: float
     used: dict[int, int]
     left_out: tuple[str, ...]
-    rms_px: float
+    rms_sigma: float
     image_covariance: Array
 
     def map_from_cam(self, place: Place) -> tuple[Pose, Array]:
@@ -83,24 +86,30 @@ def locate_body(found: BodySightings, tag: TagPose, *, arm: ArmNoise, others: Se
     seen = found.of(tag)
     if not seen:
         raise TagError(f"tag {tag.id} ({tag.family}) is never seen: {found.explanation}")
-    main, map_from_body = _alone(found, seen, tag, arm)
-    left_out, joined = [], [main]
+    main, map_from_body, doubt = _alone(found, seen, tag, arm)
+    left_out, joined, first = [], [main], None
     for other in others:
         more = found.of(other)
         if not more or other.id == tag.id:
             continue
         try:
-            part, its_body = _alone(found, more, other, arm)
+            part, its_body, _ = _alone(found, more, other, arm)
         except TagError as error:
             left_out.append(f"tag {other.id}: {error.message}")
             continue
-        pair = [_solve(found, [p], b, arm) for p, b in ((main, map_from_body), (part, its_body))]
-        apart = _apart(pair[0], pair[1])
+        first = first or _solve(found, [main], map_from_body, arm)
+        apart = _apart(first, _solve(found, [part], its_body, arm))
         if apart > AGREES:
             left_out.append(f"tag {other.id} contradicts tag {tag.id} by {math.sqrt(apart):.0f} sigma")
         else:
             joined.append(part)
-    return _solve(found, joined, map_from_body, arm, left_out=tuple(left_out))
+    if len(joined) > 1:
+        # Tags that agree have decided between the planar solutions
+        return _solve(found, joined, map_from_body, arm, left_out=tuple(left_out))
+    alone = first or _solve(found, joined, map_from_body, arm)
+    joint = alone.joint.copy()
+    joint[:6, :6] += doubt
+    return dataclasses.replace(alone, covariance=alone.covariance + doubt, joint=joint, left_out=tuple(left_out))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,8 +120,10 @@ class _Part:
     sightings: tuple[BodySighting, ...]
 
 
-def _alone(found: BodySightings, seen: Sequence[BodySighting], tag: TagPose, arm: ArmNoise) -> tuple[_Part, Pose]:
-    """Return the sightings of one tag that agree, and the body that they show by themselves."""
+def _alone(
+    found: BodySightings, seen: Sequence[BodySighting], tag: TagPose, arm: ArmNoise
+) -> tuple[_Part, Pose, Array]:
+    """Return the sightings of one tag that agree, the body that they show by themselves, and what a flip adds to it."""
     total = image_covariance(arm)
     sightings = [
         Sighting(s.detection, s.place.frame.camera, s.place.ref_from_cam, total + _step_noise(s.place, found))
@@ -126,7 +137,24 @@ def _alone(found: BodySightings, seen: Sequence[BodySighting], tag: TagPose, arm
             hint="check size_m of the tag, camera_info and tf",
         )
     used = tuple(s for s, u in zip(seen, fix.used, strict=True) if u)
-    return _Part(tag, used), body_in_map(fix, tag)
+    map_from_body = body_in_map(fix, tag)
+    return _Part(tag, used), map_from_body, _doubt(fix, tag, map_from_body)
+
+
+def _doubt(fix: TagFix, tag: TagPose, chosen: Pose) -> Array:
+    """Return what the other planar solution adds to the covariance of the body where it stays possible.
+
+    Both solutions have the odds of their residuals and of how upright the body stands; the spread of the two around the
+    chosen one is added.
+    """
+    if fix.is_certain or fix.alternative is None:
+        return np.zeros((6, 6))
+    bodies = [tag.map_from_tag * o.inv() for o in (fix.ref_from_tag, fix.alternative)]
+    worse = [(tilt(b) / UPRIGHT_RAD) ** 2 + e for b, e in zip(bodies, (0.0, fix.evidence), strict=True)]
+    first = min((0, 1), key=lambda i: tilt(bodies[i]))
+    odds = math.exp(-min(max(worse[1 - first] - worse[first], -20.0), 40.0) / 2)
+    delta = log(chosen.inv() * bodies[1 - first])
+    return odds / (1 + odds) * np.outer(delta, delta)
 
 
 def body_in_map(fix: TagFix, tag: TagPose) -> Pose:
@@ -361,9 +389,13 @@ def _solve(
 
 
 def _unlikely(problem: _Problem, state: _State, scale: float) -> float:
-    """Return twice the negative restricted log likelihood of a scale of the arm's noise, up to a constant."""
-    _, normal, total, logdet = problem.minimise(state, scale, iterations=2)
-    return total + logdet + float(np.linalg.slogdet(normal)[1])
+    """Return twice the negative restricted log likelihood of a scale of the arm's noise, up to a constant.
+
+    The state is that of another scale: what a Newton step from it gains is taken off.
+    """
+    normal, gradient, total, logdet = problem.normal(state, scale)
+    gain = float(gradient @ np.linalg.solve(normal, gradient))
+    return total - gain + logdet + float(np.linalg.slogdet(normal)[1])
 
 
 def _diagonal(degrees: float, metres: float) -> Array:

@@ -86,8 +86,8 @@ def line(name: str, found: list[Judged]) -> str:
 
 
 HEAD = (
-    "| scenario | median error | stated (root of the trace) | NEES/6, 2 % trimmed | untrimmed | outliers (0.1 % expected) "
-    "| within 2 sigma |\n|---|---|---|---|---|---|---|"
+    "| scenario | median error | stated (root of the trace) | NEES/6, 2 % trimmed | untrimmed "
+    "| outliers (0.1 % expected) | within 2 sigma |\n|---|---|---|---|---|---|---|"
 )
 
 
