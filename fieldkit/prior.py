@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from fieldkit.frames import Array, Pose, compose_covariance
 from fieldkit.odometry import ClockOffset, PlacedTag, clock_offset, travel
 from fieldkit.protocol import ArmNoise, OdometryNoise
 from fieldkit.tags import body_sightings, frames_between, locate_body, placed_tags
-from fieldkit.types import Prior, Recording, Start, TagMap, TagPose, Visit
+from fieldkit.types import Frame, Prior, Recording, Start, TagMap, TagPose, Visit
 
 # Standard deviations of a reference topic's pose where it gives the start and states none
 REFERENCE_COVARIANCE: Array = np.diag([math.radians(0.2) ** 2] * 3 + [0.005**2] * 3)
@@ -60,15 +61,20 @@ def estimate_prior(
 def odometry_clock(recording: Recording, tags: TagMap) -> ClockOffset | None:
     """Estimate the offset of odometry's stamps against the images' from standing tags that were seen in motion.
 
-    Up to 120 images, or all recorded detections, from moments in which odometry moves are searched for the tags that
+    Up to 120 images and 480 messages of recorded detections from moments in which odometry moves are searched for the tags that
     stand in one place for all visits. None where too few of them show one.
     """
     standing = _standing(tags)
     moving = [f for f in (*recording.frames, *recording.tag_frames) if _moves(recording, f.t_ns)]
-    images = [f for f in moving if f.tags is None]
-    chosen = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), MAX_MOVING)).astype(int)]
-    found: list[PlacedTag] = placed_tags([*chosen, *(f for f in moving if f.tags is not None)], standing)
+    images, messages = [f for f in moving if f.tags is None], [f for f in moving if f.tags]
+    chosen = [*_spread(images, MAX_MOVING), *_spread(messages, 4 * MAX_MOVING)]
+    found: list[PlacedTag] = placed_tags(chosen, standing)
     return clock_offset(recording.odometry, found)
+
+
+def _spread(frames: Sequence[Frame], count: int) -> list[Frame]:
+    """Return up to so many frames, evenly spread."""
+    return [frames[i] for i in np.linspace(0, len(frames) - 1, min(len(frames), count)).astype(int)]
 
 
 def _moves(recording: Recording, t_ns: int) -> bool:

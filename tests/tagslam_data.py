@@ -108,12 +108,11 @@ def _ignored(settings: Any) -> set[int]:
 
 
 def _solved(bag: BagFile) -> dict[str, Pose]:
-    """Return the last places of tags and cameras, in their parents, of the reference's tf."""
+    """Return the places of tags and cameras, in their parents, of the reference's tf: they never change in it."""
     places = {}
-    for message in bag.messages(["/tf"]):
-        for stamped in message.value.transforms:
-            p, q = stamped.transform.translation, stamped.transform.rotation
-            places[stamped.child_frame_id] = pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    for stamped in next(bag.messages(["/tf"])).value.transforms:
+        p, q = stamped.transform.translation, stamped.transform.rotation
+        places[stamped.child_frame_id] = pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
     return places
 
 

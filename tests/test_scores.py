@@ -275,7 +275,7 @@ def test_score_dict_has_the_schema_and_no_infinity() -> None:
         assert list(values) == ["version", "protocol", "pose", "thresholds", "policies", "comparisons", "truth"]
         for policy in values["policies"]:
             assert list(policy) == [
-                "name", "occlusion", "n", "recall", "interval", "median_position_m", "median_rotation_deg",
+                "name", "occlusion", "n", "recall", "interval", "median_position_m", "median_rotation_deg", "open",
             ]  # fmt: skip
             assert len(policy["recall"]) == len(policy["interval"]) == 3
     assert values["policies"][0]["median_position_m"] is None
