@@ -124,11 +124,12 @@ class Recording:
     odometry_faults: tuple[OdometryFault, ...] = ()
 
     def reference_covariance_at(self, t_ns: int) -> Array | None:
-        """Return the larger of the covariances that the topic states on either side of a time, or None."""
+        """Return the covariance that the topic states at a time, the larger one of its neighbours between, or None."""
         if self.reference is None or self.reference_covariance is None:
             return None
         right = int(np.searchsorted(self.reference.t_ns, t_ns))
-        near = self.reference_covariance[max(right - 1, 0) : right + 1]
+        exact = right < len(self.reference.t_ns) and int(self.reference.t_ns[right]) == t_ns
+        near = self.reference_covariance[right if exact else max(right - 1, 0) : right + 1]
         largest: Array = near[int(np.argmax(np.trace(near, axis1=1, axis2=2)))]
         return largest
 

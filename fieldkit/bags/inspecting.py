@@ -107,7 +107,8 @@ def _visits(
 ) -> tuple[Visit, ...]:
     try:
         if frames:
-            check_sizes(bag, content, frames)
+            if content.images:
+                check_sizes(bag, content, frames)
             return join_views(bag.path, marks, frames)[0]
     except BagError as error:
         missing.append(str(error))
