@@ -61,13 +61,13 @@ def estimate_prior(
 def odometry_clock(recording: Recording, tags: TagMap) -> ClockOffset | None:
     """Estimate the offset of odometry's stamps against the images' from standing tags that were seen in motion.
 
-    Up to 120 images and 480 messages of recorded detections from moments in which odometry moves are searched for the
+    Up to 120 images and 240 messages of recorded detections from moments in which odometry moves are searched for the
     tags that stand in one place for all visits. None where too few of them show one.
     """
     standing = _standing(tags)
     moving = [f for f in (*recording.frames, *recording.tag_frames) if _moves(recording, f.t_ns)]
     images, messages = [f for f in moving if f.tags is None], [f for f in moving if f.tags]
-    chosen = [*_spread(images, MAX_MOVING), *_spread(messages, 4 * MAX_MOVING)]
+    chosen = [*_spread(images, MAX_MOVING), *_spread(messages, 2 * MAX_MOVING)]
     found: list[PlacedTag] = placed_tags(chosen, standing)
     return clock_offset(recording.odometry, found)
 

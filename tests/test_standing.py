@@ -43,20 +43,20 @@ def nees(estimate: Pose, true: Pose, covariance: Array) -> float:
 )
 def test_stated_covariances_of_prior_and_truth_are_true(settings: Settings) -> None:
     priors, truths = [], []
-    for seed in range(16):
+    for seed in range(10):
         scene = stand(np.random.default_rng(seed), settings)
         prior, found = prior_of(scene), truths_of(scene)
         priors.append(nees(prior.map_from_body, scene.map_from_body, prior.covariance))
         view = sorted(found)[seed % len(found)]
         truths.append(nees(found[view].map_from_cam, scene.map_from_cam[view], found[view].covariance))
-    # The worst is left out; 90 degrees of freedom have their 0.1 % points at 0.59 and 1.54
-    assert 0.55 < np.mean(sorted(priors)[:-1]) < 1.54
-    assert 0.55 < np.mean(sorted(truths)[:-1]) < 1.54
+    # The worst is left out; 54 degrees of freedom have their 0.1 % points at 0.49 and 1.71
+    assert 0.45 < np.mean(sorted(priors)[:-1]) < 1.71
+    assert 0.45 < np.mean(sorted(truths)[:-1]) < 1.71
 
 
 def test_more_start_tags_tell_more() -> None:
     alone, together = [], []
-    for seed in range(6):
+    for seed in range(3):
         scene = stand(np.random.default_rng(seed), Settings(n_start_tags=3, walk_m=0.0))
         only = dataclasses.replace(scene.tags, tags=tuple(t for t in scene.tags.tags if t.id in (1, 99)))
         one, three = prior_of(dataclasses.replace(scene, tags=only)), prior_of(scene)

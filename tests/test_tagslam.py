@@ -56,7 +56,8 @@ def test_odometry_whose_stamps_are_wrong_is_noticed_with_what_and_when(shared_da
 
 def test_sound_stamps_raise_no_alarm(stairs: TagSlamTest) -> None:
     assert stairs.faults == ()
-    offset = odometry_clock(stairs.recording(), stairs.tags)
+    # Every sixth message is enough, and quicker
+    offset = odometry_clock(dataclasses.replace(stairs.recording(), tag_frames=stairs.frames[::6]), stairs.tags)
     assert offset is not None
     assert abs(offset.offset_s) < 0.01
     assert offset_fault(offset) is None
@@ -68,7 +69,7 @@ def test_jumps_that_the_authors_describe_are_the_only_alarm(shared_data: Path, t
     assert {f.kind for f in test.faults} == {"jump"}
     assert 1 <= len(test.faults) <= 20
     assert 0.2 < max(f.excess[0] for f in test.faults) < 0.4
-    offset = odometry_clock(dataclasses.replace(test.recording(), tag_frames=test.frames[::4]), test.tags)
+    offset = odometry_clock(dataclasses.replace(test.recording(), tag_frames=test.frames[::20]), test.tags)
     assert offset is not None
     assert abs(offset.offset_s) < 0.01
     assert offset_fault(offset) is None
@@ -76,7 +77,7 @@ def test_jumps_that_the_authors_describe_are_the_only_alarm(shared_data: Path, t
 
 def test_the_body_from_detections_agrees_with_the_reference(stairs: TagSlamTest) -> None:
     errors, deviations = [], []
-    for t_ns in range(int(stairs.reference.t_ns[0]) + 2 * SECOND, int(stairs.reference.t_ns[-1]) - SECOND, 6 * SECOND):
+    for t_ns in range(int(stairs.reference.t_ns[0]) + 2 * SECOND, int(stairs.reference.t_ns[-1]) - SECOND, 13 * SECOND):
         seen = seen_around(stairs, t_ns)
         if seen is None:
             continue
@@ -87,7 +88,7 @@ def test_the_body_from_detections_agrees_with_the_reference(stairs: TagSlamTest)
         errors.append(pose_error(fix.map_from_body, true))
         delta = log(fix.map_from_body.inv() * true)
         deviations.append(float(delta @ np.linalg.solve(fix.covariance, delta)) / 6)
-    assert len(errors) >= 6
+    assert len(errors) >= 3
     position, rotation = np.median(errors, axis=0)
     assert position < 0.015
     assert np.degrees(rotation) < 0.8
@@ -97,7 +98,7 @@ def test_the_body_from_detections_agrees_with_the_reference(stairs: TagSlamTest)
 def test_the_prior_after_ten_seconds_of_odometry_agrees_with_the_reference(stairs: TagSlamTest) -> None:
     errors, travelled = [], []
     for t_ns in range(
-        int(stairs.reference.t_ns[0]) + 2 * SECOND, int(stairs.reference.t_ns[-1]) - 11 * SECOND, 9 * SECOND
+        int(stairs.reference.t_ns[0]) + 2 * SECOND, int(stairs.reference.t_ns[-1]) - 11 * SECOND, 15 * SECOND
     ):
         seen = seen_around(stairs, t_ns)
         if seen is None:
@@ -114,7 +115,7 @@ def test_the_prior_after_ten_seconds_of_odometry_agrees_with_the_reference(stair
         assert delta @ np.linalg.solve(prior.covariance, delta) < 30
         errors.append(pose_error(prior.map_from_body, true))
         travelled.append(prior.travelled_m)
-    assert len(errors) >= 4
+    assert len(errors) >= 2
     assert np.median(travelled) > 0.8
     position, rotation = np.median(errors, axis=0)
     assert position < 0.04
