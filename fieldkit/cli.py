@@ -236,6 +236,7 @@ def score(run: Positional[Path], *, preset: str | None = None, json: bool = Fals
         json: print JSON
     """
     from fieldkit import scores, store
+    from fieldkit.trust import trust
 
     loaded = store.read_run(run)
     if json:
@@ -244,6 +245,9 @@ def score(run: Positional[Path], *, preset: str | None = None, json: bool = Fals
         _print_recall(loaded, preset=preset)
         for item in loaded.excluded:
             logging.getLogger(__name__).warning("excluded %s: %s", item.what, item.reason)
+        trusted = trust(loaded, thresholds=None if preset is None else scores.preset(preset))
+        if trusted is not None and trusted.warning:
+            logging.getLogger(__name__).warning("%s: %s", loaded.path, trusted.warning)
     return _missed_bounds(loaded)
 
 

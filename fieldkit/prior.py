@@ -1,39 +1,50 @@
-"""Where the robot believes it is at a waypoint: the start tag it saw, then odometry."""
+"""Where the robot believes it is at a waypoint: the start tags it saw, then odometry."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from fieldkit.errors import FrameError, PriorError, TagError
-from fieldkit.frames import Array, Pose, Trajectory, compose_covariance
-from fieldkit.protocol import OdometryNoise
-from fieldkit.tags import body_in_map, body_sightings, fuse_body_sightings
-from fieldkit.types import Prior, Recording, Start, TagMap, Visit
+from fieldkit.frames import Array, Pose, compose_covariance
+from fieldkit.odometry import ClockOffset, PlacedTag, clock_offset, travel
+from fieldkit.protocol import ArmNoise, OdometryNoise
+from fieldkit.tags import body_sightings, frames_between, locate_body, placed_tags
+from fieldkit.types import Frame, Prior, Recording, Start, TagMap, TagPose, Visit
 
-# Standard deviations of a reference topic's pose where it gives the start
+# Standard deviations of a reference topic's pose where it gives the start and states none
 REFERENCE_COVARIANCE: Array = np.diag([math.radians(0.2) ** 2] * 3 + [0.005**2] * 3)
-# Odometry that moves less than this between two samples stands: its jitter is no path
-STEP_M, STEP_RAD = 0.05, math.radians(5.0)
+# Images that are searched for tags in motion, at most
+MAX_MOVING = 120
+MOVING_M_S, MOVING_RAD_S = 0.05, math.radians(5.0)
 
 
-def estimate_prior(recording: Recording, visit: Visit, tags: TagMap, *, noise: OdometryNoise) -> Prior:
-    """Estimate map_from_body at the beginning of a visit: all sightings of the start tag, fused, then odometry.
+def estimate_prior(
+    recording: Recording, visit: Visit, tags: TagMap, *, noise: OdometryNoise, arm: ArmNoise | None = None
+) -> Prior:
+    """Estimate map_from_body at the beginning of a visit: all sightings of the start tags, fused, then odometry.
 
-    The start is the last one that names this visit, else the last one before it that names none. A start without a
-    tag takes its pose from the recording's reference topic. The covariance has the tag's, the sightings' and the
-    odometry's noise; the hand-to-camera calibration and a warp of the map are not in it. Raises PriorError, also where
-    the sightings contradict the kinematics.
+    The start is the last one that names this visit, else the last one before it that names none. Other tags of the
+    file that stand in one place for all visits join in where they are seen from the start and agree with its tag; one
+    that does not is left out and named in ``notes``. A start without a tag takes its pose from the recording's
+    reference topic. Where the interval has no image, detections that were recorded as a topic are used. The covariance
+    has the tags', the corners', the arm's and the odometry's noise, and the size of jumps in odometry; a warp of the
+    map is not in it. Raises PriorError, also where the sightings contradict the kinematics.
     """
     what = f"{recording.path}: visit {visit.id}"
     start = _start(recording, visit, what)
     if start.tag_id is None:
         t_ns, map_from_start, covariance, count = _from_reference(recording, start, what)
+        notes: tuple[str, ...] = ()
     else:
-        t_ns, map_from_start, covariance, count = _from_tag(recording, visit, start, tags, what)
+        fix = _from_tags(recording, visit, start, tags, what=what, noise=noise, arm=arm or ArmNoise())
+        t_ns, map_from_start, covariance, count, notes = fix
     try:
-        start_from_body, growth, travelled = travel(recording.odometry, t_ns, visit.t_begin_ns, noise=noise)
+        start_from_body, growth, travelled = travel(
+            recording.odometry, t_ns, visit.t_begin_ns, noise=noise, faults=recording.odometry_faults
+        )
     except FrameError as error:
         raise PriorError(f"{what}: no odometry from its start: {error.message}", hint="check the odometry") from error
     return Prior(
@@ -43,51 +54,44 @@ def estimate_prior(recording: Recording, visit: Visit, tags: TagMap, *, noise: O
         visit.t_begin_ns,
         travelled,
         count,
+        notes,
     )
 
 
-def travel(odometry: Trajectory, t_from_ns: int, t_to_ns: int, *, noise: OdometryNoise) -> tuple[Pose, Array, float]:
-    """Return from_body_to_body between two times by odometry, its 6x6 covariance, and the length of the path in m.
+def odometry_clock(recording: Recording, tags: TagMap) -> ClockOffset | None:
+    """Estimate the offset of odometry's stamps against the images' from standing tags that were seen in motion.
 
-    Drift is taken as constant along the path, so standard deviations grow in proportion to it: position by
-    ``position_per_m``, yaw by ``yaw_deg_per_m`` and ``yaw_deg_per_turn_deg``; a yaw error moves everything after it.
-    Raises FrameError when the samples do not reach or have a gap.
+    Up to 120 images and 240 messages of recorded detections from moments in which odometry moves are searched for the
+    tags that stand in one place for all visits. None where too few of them show one.
     """
-    path = [odometry.at(t_from_ns), *_between(odometry, t_from_ns, t_to_ns), odometry.at(t_to_ns)]
-    anchors = [path[0]]
-    steps: list[tuple[float, float]] = []
-    for index, pose in enumerate(path[1:], start=1):
-        moved = anchors[-1].inv() * pose
-        length, turn = float(np.linalg.norm(moved.translation)), float(moved.rotation.magnitude())
-        if length > STEP_M or turn > STEP_RAD or index == len(path) - 1:
-            anchors.append(pose)
-            steps.append((length, turn))
-    per_m, per_turn = np.zeros(6), np.zeros(6)
-    for anchor, (length, turn) in zip(anchors[1:], steps, strict=True):
-        end_from_anchor = path[-1].inv() * anchor
-        axis = end_from_anchor.rotation.apply([0.0, 0.0, 1.0])
-        effect = np.concatenate([axis, np.cross(end_from_anchor.translation, axis)])
-        per_m += length * effect
-        per_turn += turn * effect
-    travelled = sum(length for length, _ in steps)
-    covariance = math.radians(noise.yaw_deg_per_m) ** 2 * np.outer(per_m, per_m)
-    covariance += noise.yaw_deg_per_turn_deg**2 * np.outer(per_turn, per_turn)
-    covariance[3:, 3:] += (noise.position_per_m * travelled) ** 2 * np.eye(3)
-    return path[0].inv() * path[-1], covariance, travelled
+    standing = _standing(tags)
+    moving = [f for f in (*recording.frames, *recording.tag_frames) if _moves(recording, f.t_ns)]
+    images, messages = [f for f in moving if f.tags is None], [f for f in moving if f.tags]
+    chosen = [*_spread(images, MAX_MOVING), *_spread(messages, 2 * MAX_MOVING)]
+    found: list[PlacedTag] = placed_tags(chosen, standing)
+    return clock_offset(recording.odometry, found)
 
 
-def _between(odometry: Trajectory, t_from_ns: int, t_to_ns: int) -> list[Pose]:
-    first, last = sorted((t_from_ns, t_to_ns))
-    times = odometry.t_ns
-    inside = np.flatnonzero((times > first) & (times < last))
-    gaps = np.diff([first, *times[inside].tolist(), last])
-    if len(gaps) and int(gaps.max()) > odometry.max_gap_ns:
-        raise FrameError(
-            f"{odometry.parent}_from_{odometry.child} has a gap of {gaps.max() / 1e9:.2f} s between {first} and "
-            f"{last} ns; at most {odometry.max_gap_ns / 1e9:.2f} s is bridged"
-        )
-    found = [odometry.poses[int(i)] for i in inside]
-    return found if t_from_ns <= t_to_ns else found[::-1]
+def _spread(frames: Sequence[Frame], count: int) -> list[Frame]:
+    """Return up to so many frames, evenly spread."""
+    return [frames[i] for i in np.linspace(0, len(frames) - 1, min(len(frames), count)).astype(int)]
+
+
+def _moves(recording: Recording, t_ns: int) -> bool:
+    half = 250_000_000
+    try:
+        moved = recording.odometry.at(t_ns - half).inv() * recording.odometry.at(t_ns + half)
+    except FrameError:
+        return False
+    seconds = 2 * half / 1e9
+    fast = float(np.linalg.norm(moved.translation)) > MOVING_M_S * seconds
+    return fast or float(moved.rotation.magnitude()) > MOVING_RAD_S * seconds
+
+
+def _standing(tags: TagMap) -> list[TagPose]:
+    """Return the tags that stand in one place for all visits, but those that failed."""
+    carried = {t.id for t in tags.tags if t.visit is not None}
+    return [t for t in tags.tags if t.id not in carried and t.verdict != "fail"]
 
 
 def _start(recording: Recording, visit: Visit, what: str) -> Start:
@@ -108,14 +112,16 @@ def _from_reference(recording: Recording, start: Start, what: str) -> tuple[int,
             f"{what}: its start names no tag and the recording has no reference topic; expected one of them"
         )
     try:
-        return start.t_begin_ns, recording.reference.at(start.t_begin_ns), REFERENCE_COVARIANCE, 0
+        map_from_body = recording.reference.at(start.t_begin_ns)
     except FrameError as error:
         raise PriorError(f"{what}: no reference pose at its start: {error.message}") from error
+    stated = recording.reference_covariance_at(start.t_begin_ns)
+    return start.t_begin_ns, map_from_body, REFERENCE_COVARIANCE if stated is None else stated, 0
 
 
-def _from_tag(
-    recording: Recording, visit: Visit, start: Start, tags: TagMap, what: str
-) -> tuple[int, Pose, Array, int]:
+def _from_tags(
+    recording: Recording, visit: Visit, start: Start, tags: TagMap, *, what: str, noise: OdometryNoise, arm: ArmNoise
+) -> tuple[int, Pose, Array, int, tuple[str, ...]]:
     assert start.tag_id is not None
     tag = tags.find(start.tag_id, visit=visit.id)
     if tag is None:
@@ -124,10 +130,11 @@ def _from_tag(
             f"{what}: start tag {start.tag_id} is not in {tags.path or 'the tag file'}; it has tags {known}",
             hint="photograph and calibrate this tag, or correct the start's tag_id",
         )
-    frames = [f for f in recording.frames if start.t_begin_ns <= f.t_ns <= start.t_end_ns]
+    others = [t for t in _standing(tags) if t.id != tag.id]
+    frames = frames_between(recording, start.t_begin_ns, start.t_end_ns)
     try:
-        found = body_sightings(frames, tag, odometry=recording.odometry)
-        fix = fuse_body_sightings(found.sightings, tag) if found.sightings else None
+        found = body_sightings(frames, [tag, *others], odometry=recording.odometry, noise=noise)
+        fix = locate_body(found, tag, arm=arm, others=others) if found.of(tag) else None
     except TagError as error:
         raise PriorError(f"{what}: start tag {tag.id}: {error.message}", hint=error.hint) from error
     if fix is None:
@@ -136,5 +143,5 @@ def _from_tag(
             f"{found.explanation}",
             hint="turn the arm camera to the tag at the start, or correct the interval, id or family",
         )
-    map_from_body, covariance = body_in_map(fix, tag)
-    return found.t_ns, map_from_body, covariance, sum(fix.used)
+    notes = tuple(f"at the start {note}; it is left out" for note in fix.left_out)
+    return fix.t_ns, fix.map_from_body, fix.covariance, sum(fix.used.values()), notes

@@ -19,6 +19,7 @@ POLICY_NAMES = (
 )  # fmt: skip
 COUNTING = ("max", "angle", "fim", "mlp", "vpt", "vpt_dino", "vpt_appearance")
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Pitch = Annotated[float, msgspec.Meta(ge=-90, le=90)]
 
@@ -57,11 +58,33 @@ class LocalizerRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Standard deviations with which the prior's covariance grows per metre travelled and radian turned."""
+    """Standard deviations with which the prior's covariance grows along the path.
+
+    ``*_per_m`` and ``yaw_deg_per_turn_deg`` are biases, which grow with distance (m) and turning (deg);
+    ``*_per_root_m`` are random walks, which grow with the root of distance.
+    """
 
     position_per_m: Positive = 0.02
     yaw_deg_per_m: Positive = 0.5
     yaw_deg_per_turn_deg: Positive = 0.01
+    position_per_root_m: NotNegative = 0.01
+    yaw_deg_per_root_m: NotNegative = 0.5
+
+
+class ArmNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Standard deviations per axis of body_from_cam from joint angles: deg and m.
+
+    ``image_*`` is anew in every image (encoders, sway, stamps), and scaled to what the sightings show. ``camera_*`` and
+    ``base_*`` are the same in all images of a visit: the camera in the hand and the zeros of the joints, seen at the
+    camera, and the arm on the body.
+    """
+
+    image_deg: Positive = 0.2
+    image_m: Positive = 0.002
+    camera_deg: NotNegative = 0.15
+    camera_m: NotNegative = 0.0015
+    base_deg: NotNegative = 0.1
+    base_m: NotNegative = 0.001
 
 
 class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -89,6 +112,7 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     occlusion: OcclusionRules = OcclusionRules()
     localizer: LocalizerRules = LocalizerRules()
     odometry: OdometryNoise = OdometryNoise()
+    arm: ArmNoise = ArmNoise()
     expect: tuple[Expect, ...] = ()
 
 
@@ -163,7 +187,7 @@ def _explain(text: str) -> str:
 def _fields_at(where: str) -> list[str]:
     structs: dict[str, type[msgspec.Struct]] = {
         "thresholds": Threshold, "candidates": CandidateRules, "occlusion": OcclusionRules,
-        "localizer": LocalizerRules, "odometry": OdometryNoise, "expect": Expect,
+        "localizer": LocalizerRules, "odometry": OdometryNoise, "arm": ArmNoise, "expect": Expect,
     }  # fmt: skip
     part = re.match(r"\$\.(\w+)", where)
     return list((structs[part.group(1)] if part else Protocol).__struct_fields__)

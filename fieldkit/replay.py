@@ -20,8 +20,10 @@ from fieldkit.bags import open_recording
 from fieldkit.errors import FrameError, PriorError, ReplayError, TagError, TruthError
 from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer
-from fieldkit.prior import estimate_prior
+from fieldkit.odometry import offset_fault, summarize_faults
+from fieldkit.prior import estimate_prior, odometry_clock
 from fieldkit.protocol import Protocol
+from fieldkit.trust import trust
 from fieldkit.truth import estimate_truths
 from fieldkit.types import (
     Candidates,
@@ -94,6 +96,9 @@ def replay(
     if not run.trials:
         reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3]) or "there is no visit"
         raise ReplayError(f"{recordings[0]}: no visit could be scored: {reasons}", hint="see the reasons")
+    trusted = trust(run)
+    if trusted is not None and trusted.warning:
+        log.warning("%s", trusted.warning)
     store.write_run(out, run, force=force)
     cache.remove()
     return run
@@ -167,7 +172,13 @@ def _replay_session(
     progress: Progress | None,
 ) -> _Session:
     _check_tags(recording, tags)
-    for warning in recording.warnings:
+    if not recording.frames:
+        raise ReplayError(
+            f"{recording.path}: has tag detections but no image; expected images of the arm camera to localize",
+            hint="record the arm camera's images",
+        )
+    clock = offset_fault(odometry_clock(recording, tags))
+    for warning in (*recording.warnings, *summarize_faults(() if clock is None else (clock,))):
         log.warning("%s: %s", recording.path, warning)
     ready, excluded = _prepare(recording, tags, protocol)
     localizer = Localizer(scene_map, protocol.localizer, seed=protocol.seed)
@@ -208,15 +219,18 @@ def _prepare(recording: Recording, tags: TagMap, protocol: Protocol) -> tuple[di
     excluded: list[Excluded] = []
     for visit in recording.visits:
         try:
-            priors[visit.id] = estimate_prior(recording, visit, tags, noise=protocol.odometry)
+            priors[visit.id] = estimate_prior(recording, visit, tags, noise=protocol.odometry, arm=protocol.arm)
         except EXCLUDING as error:
             excluded.append(Excluded(f"{recording.name}/{visit.id}", str(error)))
+    for prior in priors.values():
+        for note in prior.notes:
+            log.warning("%s: visit %s: %s", recording.path, prior.visit, note)
     located = [v for v in recording.visits if v.id in priors]
     # The way goes on to the next waypoint whether or not its truth is known.
     ahead = forward_directions(located, [priors[v.id] for v in located], rules=protocol.candidates)
     for visit, direction in zip(located, ahead, strict=True):
         try:
-            truths = estimate_truths(recording, visit, tags)
+            truths = estimate_truths(recording, visit, tags, noise=protocol.odometry, arm=protocol.arm)
             usable, dropped = _usable_views(recording, visit, truths)
             candidates = recorded_candidates(
                 recording, usable, priors[visit.id], rules=protocol.candidates, forward_in_map=direction

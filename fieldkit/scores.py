@@ -22,11 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 from fieldkit.errors import ScoreError, suggestion
 from fieldkit.frames import Pose, pose_error
 from fieldkit.protocol import Protocol, Threshold
+from fieldkit.trust import BEST_POSSIBLE as BEST_POSSIBLE
+from fieldkit.trust import open_shares, open_words, trust, trust_dict, truths_of
 from fieldkit.types import Run, Trial, Truth, ViewResult, VisitPlan
 
 Array = NDArray[np.float64]
 PoseName = Literal["cam", "body"]
-BEST_POSSIBLE = "best_possible"
 ODOMETRY = "odometry"
 NO_CANDIDATE = "no_candidate"
 INFINITE = (math.inf, math.inf)
@@ -358,6 +359,7 @@ def summarize_run(run: Run, *, thresholds: Sequence[Threshold] | None = None) ->
 def score_dict(run: Run, *, thresholds: Sequence[Threshold] | None = None) -> dict[str, Any]:
     """Return the values of ``fieldkit score --json``: fractions, m and deg, null for an infinite median."""
     chosen = run.protocol.thresholds if thresholds is None else thresholds
+    truths, groups = truths_of(run), group(run.trials)
     return {
         "version": 1,
         "protocol": run.protocol.name,
@@ -372,10 +374,14 @@ def score_dict(run: Run, *, thresholds: Sequence[Threshold] | None = None) -> di
                 "interval": [list(pair) for pair in s.interval],
                 "median_position_m": _finite(s.median[0]),
                 "median_rotation_deg": _finite(math.degrees(s.median[1])),
+                "open": list(
+                    open_shares(groups[s.policy, s.occlusion], truths, thresholds=chosen, pose=run.protocol.pose)
+                ),
             }
             for s in summarize_run(run, thresholds=chosen)
         ],
         "comparisons": [],
+        "truth": trust_dict(trust(run, thresholds=chosen)),
     }
 
 
@@ -416,8 +422,10 @@ def table(run: Run, *, thresholds: Sequence[Threshold] | None = None) -> Table:
         median = [format_number(s.median[0]), format_number(math.degrees(s.median[1]))]
         occlusion = "-" if s.occlusion is None else "yes" if s.occlusion else "no"
         rows.append((s.policy, occlusion, str(s.n), *cells, *median))
+    trusted = trust(run, thresholds=chosen)
+    caption = f"Recall in % of visits, {pose} pose strictly inside both bounds [Wilson 95 %]; failures count."
     return Table(
-        caption=f"Recall in % of visits, {pose} pose strictly inside both bounds [Wilson 95 %]; failures count.",
+        caption=caption if trusted is None else f"{caption} {open_words(trusted, chosen)}",
         header=("policy", "occlusion", "n", *columns, "median m", "median deg"),
         rows=tuple(rows),
     )

@@ -22,17 +22,32 @@ ViewKind = Literal["sweep", "stowed", "forward", "truth"]
 VIEW_KINDS: tuple[ViewKind, ...] = ("sweep", "stowed", "forward", "truth")
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class SeenTag:
+    """A tag that a detector on the robot saw: corners f64[4, 2] in COLMAP pixels, from bottom-left counter-clockwise.
+
+    ``family`` and ``sigma_px`` (noise per coordinate) are None where the recording does not tell them.
+    """
+
+    id: int
+    family: str | None
+    corners_px: Array
+    sigma_px: float | None = None
+
+
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """One image of the robot's arm camera: header stamp, camera, kinematics, and the image read on demand.
 
     ``read()`` returns uint8[h, w] (grey) or uint8[h, w, 3] (RGB). ``body_from_cam`` is None where tf does not reach.
+    ``tags`` are those that were detected while recording; None where the image itself is to be searched.
     """
 
     t_ns: int
     camera: Camera
     body_from_cam: Pose | None
     read: Callable[[], Image]
+    tags: tuple[SeenTag, ...] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,11 +86,28 @@ class Visit:
 
 
 @dataclasses.dataclass(frozen=True)
+class OdometryFault:
+    """Something wrong with odometry from ``t_begin_ns`` to ``t_end_ns``: what kind, and a sentence with numbers.
+
+    ``excess`` is by how much (m, rad) a jump exceeds what its neighbours say.
+    """
+
+    kind: Literal["gap", "jump", "order", "repeat", "rate", "latency", "offset"]
+    t_begin_ns: int
+    t_end_ns: int
+    message: str
+    excess: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
 class Recording:
     """A recorded session: everything that replay needs, images on demand.
 
     ``frames`` all images of the arm camera in the order of their stamps. ``odometry`` is odom_from_body.
-    ``reference`` is map_from_body from a pose topic (motion capture, total station, another system) or None.
+    ``reference`` is map_from_body from a pose topic (motion capture, total station, another system) or None, and
+    ``reference_covariance`` f64[n, 6, 6] what the topic says of its samples (right perturbation) or None.
+    ``tag_frames`` are messages of tag detections, frames without an image. ``odometry_faults`` say what is wrong with
+    odometry, and when.
     """
 
     name: str
@@ -87,6 +119,19 @@ class Recording:
     visits: tuple[Visit, ...]
     reference: Trajectory | None = None
     warnings: tuple[str, ...] = ()
+    reference_covariance: Array | None = None
+    tag_frames: tuple[Frame, ...] = ()
+    odometry_faults: tuple[OdometryFault, ...] = ()
+
+    def reference_covariance_at(self, t_ns: int) -> Array | None:
+        """Return the covariance that the topic states at a time, the larger one of its neighbours between, or None."""
+        if self.reference is None or self.reference_covariance is None:
+            return None
+        right = int(np.searchsorted(self.reference.t_ns, t_ns))
+        exact = right < len(self.reference.t_ns) and int(self.reference.t_ns[right]) == t_ns
+        near = self.reference_covariance[right if exact else max(right - 1, 0) : right + 1]
+        largest: Array = near[int(np.argmax(np.trace(near, axis1=1, axis2=2)))]
+        return largest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,7 +281,10 @@ class LandmarkStatistics:
 
 @dataclasses.dataclass(frozen=True)
 class Prior:
-    """Where the robot believes its body is at a waypoint: pose, 6x6 covariance, metres travelled since the start."""
+    """Where the robot believes its body is at a waypoint: pose, 6x6 covariance, metres travelled since the start.
+
+    ``notes`` say what was left out on the way to it.
+    """
 
     visit: str
     map_from_body: Pose
@@ -244,6 +292,7 @@ class Prior:
     t_ns: int
     travelled_m: float
     n_sightings: int
+    notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

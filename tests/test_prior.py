@@ -11,11 +11,12 @@ from tag_scenes import SECOND, Robot, stand_and_look
 
 from fieldkit.errors import PriorError
 from fieldkit.frames import Pose, Trajectory, exp, log, pose_error, yaw_pose
-from fieldkit.prior import estimate_prior, travel
+from fieldkit.odometry import travel
+from fieldkit.prior import estimate_prior
 from fieldkit.protocol import OdometryNoise
 from fieldkit.types import Prior, Start, TagMap
 
-NOISE = OdometryNoise()
+NOISE = OdometryNoise(position_per_root_m=0.0, yaw_deg_per_root_m=0.0)
 
 
 def prior_of(robot: Robot) -> Prior:
@@ -111,7 +112,9 @@ def test_covariance_of_travel_is_that_of_simulated_drift() -> None:
     for step in steps:
         clean.append(clean[-1] * step)
     odometry = Trajectory(np.arange(61) * SECOND // 10, tuple(clean), "odom", "body")
-    delta, covariance, _ = travel(odometry, 0, 6 * SECOND, noise=OdometryNoise(position_per_m=1e-9))
+    delta, covariance, _ = travel(
+        odometry, 0, 6 * SECOND, noise=OdometryNoise(position_per_m=1e-9, position_per_root_m=0, yaw_deg_per_root_m=0)
+    )
     for _ in range(120):
         per_m = rng.normal(0, math.radians(0.5))
         pose = Pose.identity()

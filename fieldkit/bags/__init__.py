@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from fieldkit.bags.arm import ArmRecording, Kinematics, open_arm
-from fieldkit.bags.detections import RecordedTag, RecordedTags, read_detections
+from fieldkit.bags.detections import RecordedTags, read_detections
 from fieldkit.bags.inspecting import inspect_recording
 from fieldkit.bags.layouts import LAYOUTS, Layout
 from fieldkit.bags.reading import open_recording
+from fieldkit.bags.tag_messages import RecordedTag
 from fieldkit.bags.tf import TfBuffer
 from fieldkit.bags.writing import BagFormat, RecordingWriter
 

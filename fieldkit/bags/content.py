@@ -15,10 +15,15 @@ from fieldkit.bags.layouts import Layout
 from fieldkit.bags.tf import TfBuffer, clean_frame
 from fieldkit.cameras import Camera, camera_from_info
 from fieldkit.errors import BagError, FieldkitError
-from fieldkit.frames import Pose, Trajectory, pose
+from fieldkit.frames import Array, Pose, Trajectory, pose
 
 # Message types that may stand on the topics of a layout
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_REFERENCE_TYPES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
+)
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -34,19 +39,33 @@ class ImagePlace:
 
 @dataclasses.dataclass
 class PoseSamples:
-    """Stamped poses in the order of arrival, with the frames that their messages name."""
+    """Stamped poses in the order of arrival, with the frames that their messages name.
+
+    ``received`` are the times of arrival, ``covariances`` (6x6, right perturbation) what the messages state, or None.
+    """
 
     samples: list[tuple[int, Pose]] = dataclasses.field(default_factory=list)
     parent: str = ""
     child: str = ""
+    received: list[int] = dataclasses.field(default_factory=list)
+    covariances: list[Array | None] = dataclasses.field(default_factory=list)
 
     def trajectory(self, *, parent: str, child: str) -> tuple[Trajectory, int]:
         """Return the trajectory, and how many samples it left out because their stamp repeats an earlier one."""
-        ordered = sorted(self.samples, key=lambda item: item[0])
-        kept = [s for i, s in enumerate(ordered) if i == 0 or s[0] != ordered[i - 1][0]]
-        stamps = np.array([t for t, _ in kept], dtype=np.int64)
-        poses = tuple(p for _, p in kept)
-        return Trajectory(stamps, poses, self.parent or parent, self.child or child), len(ordered) - len(kept)
+        kept = self._kept()
+        stamps = np.array([self.samples[i][0] for i in kept], dtype=np.int64)
+        poses = tuple(self.samples[i][1] for i in kept)
+        return Trajectory(stamps, poses, self.parent or parent, self.child or child), len(self.samples) - len(kept)
+
+    def covariance(self) -> Array | None:
+        """Return the stated covariances f64[n, 6, 6] of the trajectory's samples; None unless all state one."""
+        stated = [self.covariances[i] for i in self._kept()] if self.covariances else []
+        known = [c for c in stated if c is not None]
+        return np.stack(known) if known and len(known) == len(stated) else None
+
+    def _kept(self) -> list[int]:
+        order = sorted(range(len(self.samples)), key=lambda i: self.samples[i][0])
+        return [i for k, i in enumerate(order) if k == 0 or self.samples[i][0] != self.samples[order[k - 1]][0]]
 
 
 @dataclasses.dataclass
@@ -109,9 +128,10 @@ def collect(bag: BagFile, layout: Layout) -> Content:
             except BagError as error:
                 content.camera_error = content.camera_error or error
         elif message.topic == layout.odometry and kind == "nav_msgs/msg/Odometry":
-            _add_pose(content, content.odometry, value, value.pose.pose, child=value.child_frame_id)
-        elif message.topic == layout.reference and kind == "geometry_msgs/msg/PoseStamped":
-            _add_pose(content, content.reference, value, value.pose, child="")
+            add_pose(content.refused, content.odometry, value, value.pose.pose, received_ns=message.place.log_ns)
+        elif message.topic == layout.reference and kind in _REFERENCE_TYPES:
+            inner = value.pose if kind == _REFERENCE_TYPES[0] else value.pose.pose
+            add_pose(content.refused, content.reference, value, inner, received_ns=message.place.log_ns)
         elif message.topic in (layout.tf, layout.tf_static) and kind in _TF_TYPES:
             _add_transforms(content, value.transforms, static=message.topic == layout.tf_static)
         elif message.topic == layout.events and kind == "std_msgs/msg/String":
@@ -142,16 +162,44 @@ def _camera(bag: BagFile, topic: str, info: Any, cache: dict[tuple[Any, ...], Ca
     return cache[key]
 
 
-def _add_pose(content: Content, samples: PoseSamples, message: Any, value: Any, *, child: str) -> None:
+def read_odometry(bag: BagFile, topic: str) -> PoseSamples:
+    """Read the poses of a nav_msgs/Odometry topic that no layout names."""
+    samples, refused = PoseSamples(), Counter[str]()
+    for message in bag.messages([topic]):
+        add_pose(refused, samples, message.value, message.value.pose.pose, received_ns=message.place.log_ns)
+    return samples
+
+
+def add_pose(refused: Counter[str], samples: PoseSamples, message: Any, value: Any, *, received_ns: int) -> None:
+    """Add a stamped pose with the covariance that its message states; count it where its numbers are impossible."""
     p, q = value.position, value.orientation
     try:
         sample = pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
     except FieldkitError:
-        content.refused["poses with impossible numbers"] += 1
+        refused["poses with impossible numbers"] += 1
         return
     samples.samples.append((stamp_ns(message.header), sample))
+    samples.received.append(received_ns)
+    samples.covariances.append(_stated_covariance(message, sample))
     samples.parent = samples.parent or clean_frame(message.header.frame_id)
-    samples.child = samples.child or clean_frame(child)
+    samples.child = samples.child or clean_frame(getattr(message, "child_frame_id", ""))
+
+
+def _stated_covariance(message: Any, parent_from_child: Pose) -> Array | None:
+    """Return the 6x6 covariance (right perturbation, rotation first) that a message states; None where it is unknown.
+
+    ROS gives position, then rotation about the parent's fixed axes. Zeros, and -1 in the first place, say unknown.
+    """
+    values = getattr(message.pose, "covariance", None)
+    if values is None:
+        return None
+    matrix = np.asarray(values, dtype=np.float64).reshape(6, 6)
+    fixed = np.block([[matrix[3:, 3:], matrix[3:, :3]], [matrix[:3, 3:], matrix[:3, :3]]])
+    if not np.isfinite(fixed).all() or not (np.linalg.eigvalsh((fixed + fixed.T) / 2) > 0).all():
+        return None
+    turn = np.kron(np.eye(2), parent_from_child.rotation.as_matrix().T)
+    result: Array = turn @ (fixed + fixed.T) / 2 @ turn.T
+    return result
 
 
 def _add_transforms(content: Content, transforms: Iterable[Any], *, static: bool) -> None:

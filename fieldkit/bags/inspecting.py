@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from fieldkit.bags.checking import odometry_elsewhere, odometry_faults
 from fieldkit.bags.content import Content, collect
 from fieldkit.bags.events import Marks, find_marks
 from fieldkit.bags.files import BagFile
@@ -20,7 +21,9 @@ from fieldkit.bags.reading import (
     open_source,
     session_warnings,
 )
+from fieldkit.bags.tagged import detection_topics, tag_frames
 from fieldkit.errors import BagError
+from fieldkit.odometry import summarize_faults
 from fieldkit.types import Frame, Visit
 
 
@@ -28,7 +31,7 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
     """Return what a recording holds and lacks as a dict for JSON; times in ns and s.
 
     Keys: version, path, name, format, duration_s, n_messages, layout (None when none fits), topics, images, depth,
-    odometry, joint_states, reference, starts, visits, warnings, missing. Raises BagError only for a file that
+    odometry, joint_states, reference, detections, starts, visits, warnings, missing. Raises BagError only for a file
     cannot be opened or is damaged.
     """
     source = open_source(path)
@@ -44,16 +47,20 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
         missing.append(str(error))
     if content.camera_error is not None:
         missing.append(str(content.camera_error))
-    missing += _missing(used, content, marks)
+    missing += _missing(bag, used, content, marks)
     warnings = list(marks.warnings)
     odometry, repeated = content.odometry.trajectory(parent=used.odom_frame, child=used.body_frame)
     warnings += general_warnings(bag, content, repeated)
+    warnings += summarize_faults(odometry_faults(content)) if len(odometry) else odometry_elsewhere(bag, content)
     frames: tuple[Frame, ...] = ()
     visits: tuple[Visit, ...] = ()
     unreached: list[str] = []
+    tagged: tuple[Frame, ...] = ()
     if content.cameras:
         frames, unreached = make_frames(bag, content, camera_frame=used.camera_frame, body_frame=odometry.child)
-        visits = _visits(bag, content, marks, frames, missing=missing)
+        tagged, notes = tag_frames(bag, content, camera_frame=used.camera_frame, body_frame=odometry.child)
+        warnings += notes
+        visits = _visits(bag, content, marks, frames or tagged, missing=missing)
     if visits and len(odometry):
         warnings += session_warnings(visits, odometry, content)
     if unreached:
@@ -75,6 +82,7 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
             "names": sorted({name for _, angles in content.joints for name in angles}),
         },
         "reference": {"count": len(content.reference.samples)},
+        "detections": _detections(bag, tagged),
         "starts": [dataclasses.asdict(start) for start in marks.starts],
         "visits": _visit_rows(marks, visits),
         "warnings": warnings,
@@ -82,9 +90,9 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
     }
 
 
-def _missing(layout: Layout, content: Content, marks: Marks) -> list[str]:
+def _missing(bag: BagFile, layout: Layout, content: Content, marks: Marks) -> list[str]:
     needed: list[tuple[object, str]] = [
-        (content.images, f"images on {layout.compressed} or {layout.image}"),
+        (content.images or detection_topics(bag), f"images on {layout.compressed} or {layout.image}"),
         (content.cameras, f"camera_info on {layout.camera_info}"),
         (content.tf.frames, f"tf on {layout.tf} or {layout.tf_static}"),
         (content.odometry.samples, f"odometry on {layout.odometry}"),
@@ -99,7 +107,8 @@ def _visits(
 ) -> tuple[Visit, ...]:
     try:
         if frames:
-            check_sizes(bag, content, frames)
+            if content.images:
+                check_sizes(bag, content, frames)
             return join_views(bag.path, marks, frames)[0]
     except BagError as error:
         missing.append(str(error))
@@ -115,6 +124,12 @@ def _images(content: Content, frames: tuple[Frame, ...], *, n_unreached: int) ->
         "without_tf": n_unreached,
         "cameras": dict(sizes),
     }
+
+
+def _detections(bag: BagFile, tagged: tuple[Frame, ...]) -> dict[str, Any]:
+    ids = Counter(tag.id for frame in tagged for tag in frame.tags or ())
+    topics = [{"name": name, "count": bag.topics[name].count} for name in detection_topics(bag)]
+    return {"topics": topics, "tags": {str(tag_id): count for tag_id, count in sorted(ids.items())}}
 
 
 def _depth(bag: BagFile, layout: Layout) -> dict[str, Any]:

@@ -9,14 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
+from fieldkit.bags.checking import odometry_faults
 from fieldkit.bags.content import Content, collect
 from fieldkit.bags.events import Marks, ViewMark, find_marks
 from fieldkit.bags.files import BagFile, Place
 from fieldkit.bags.images import decode_image
 from fieldkit.bags.layouts import LAYOUTS, ROBOT, Layout, detect_layout, find_layout, fit_layout
+from fieldkit.bags.tagged import detection_topics, tag_frames
 from fieldkit.cameras import Camera
 from fieldkit.errors import BagError, FrameError
 from fieldkit.frames import Pose, Trajectory
+from fieldkit.odometry import summarize_faults
 from fieldkit.store import SessionFile, read_session
 from fieldkit.types import Frame, Image, Recording, View, Visit
 
@@ -50,6 +53,7 @@ def open_recording(path: Path | str, *, layout: str | Layout | None = None) -> R
     _require_topics(bag, chosen)
     content = collect(bag, chosen)
     _require_content(bag, chosen, content)
+    faults = odometry_faults(content)
     marks = find_marks(content.events, source.session, path=bag.path, t_end_ns=content.last_ns)
     if not marks.visits:
         raise BagError(
@@ -59,11 +63,12 @@ def open_recording(path: Path | str, *, layout: str | Layout | None = None) -> R
         )
     odometry, repeated = content.odometry.trajectory(parent=chosen.odom_frame, child=chosen.body_frame)
     frames, unreached = make_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=odometry.child)
-    visits, notes = join_views(bag.path, marks, frames)
+    tagged, tag_notes = tag_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=odometry.child)
+    visits, notes = join_views(bag.path, marks, frames or tagged)
     _require_tf(bag.path, visits, content, unreached)
     check_sizes(bag, content, frames)
     warnings = [*general_warnings(bag, content, repeated), *marks.warnings, *notes, *_tf_warnings(frames, unreached)]
-    warnings += session_warnings(visits, odometry, content)
+    warnings += [*session_warnings(visits, odometry, content), *tag_notes, *summarize_faults(faults)]
     return Recording(
         name=source.name,
         path=str(path),
@@ -74,6 +79,9 @@ def open_recording(path: Path | str, *, layout: str | Layout | None = None) -> R
         visits=visits,
         reference=reference(content, odometry.child),
         warnings=tuple(warnings),
+        reference_covariance=content.reference.covariance(),
+        tag_frames=tagged,
+        odometry_faults=faults,
     )
 
 
@@ -207,7 +215,7 @@ def _require_topics(bag: BagFile, layout: Layout) -> None:
     where = f"; the bag has {topic_list(bag)}"
     hint = "record the topic, or name the layout that has it in a session.toml"
     needed: dict[str, tuple[str, ...]] = {
-        "image": (layout.compressed, layout.image),
+        "image": (layout.compressed, layout.image, *detection_topics(bag)),
         "camera_info": (layout.camera_info,),
         "tf": (layout.tf, layout.tf_static),
         "odometry": (layout.odometry,),
@@ -222,7 +230,7 @@ def _require_topics(bag: BagFile, layout: Layout) -> None:
 
 def _require_content(bag: BagFile, layout: Layout, content: Content) -> None:
     found: dict[str, tuple[object, str, str]] = {
-        "image": (content.images, content.image_topic, "sensor_msgs/Image or CompressedImage"),
+        "image": (content.images or detection_topics(bag), content.image_topic, "sensor_msgs/Image or CompressedImage"),
         "camera_info": (content.cameras, layout.camera_info, "sensor_msgs/CameraInfo"),
         "tf": (content.tf.frames, f"{layout.tf} or {layout.tf_static}", "tf2_msgs/TFMessage"),
         "odometry": (content.odometry.samples, layout.odometry, "nav_msgs/Odometry with finite poses"),

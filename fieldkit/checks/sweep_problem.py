@@ -18,7 +18,8 @@ from fieldkit.checks.parameters import (
 )
 from fieldkit.checks.sweeps import Sweep
 from fieldkit.frames import Array, Pose
-from fieldkit.tags import ARM_COVARIANCE, tag_corners
+from fieldkit.protocol import ArmNoise
+from fieldkit.tags import image_covariance, tag_corners
 
 Mask = NDArray[np.bool_]
 
@@ -41,6 +42,7 @@ GRID = {
     "jitter_s": (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016),
     "blur_s": (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016),
 }
+ARM_PER_IMAGE = image_covariance(ArmNoise())
 _TAG_STEP = 1e-5
 
 
@@ -48,7 +50,7 @@ _TAG_STEP = 1e-5
 class Noise:
     """What residuals may be made of beside the corners' own noise; a still arm shows only the first.
 
-    ``arm`` is the factor of the arm's stated standard deviations (ARM_COVARIANCE). ``jitter_s``: an image is taken at
+    ``arm`` is the factor of the arm's stated standard deviations in one image (`ArmNoise`). ``jitter_s``: an image is taken at
     another time than stated, or between samples of an arm that does not move evenly. ``blur_s``: corners of a moving
     image err by so many seconds of its motion, each by itself.
     """
@@ -209,7 +211,7 @@ class Problem:
         speed = np.mean(linear.by_time**2, axis=1) * 2
         own = self.sigma**2 + noise.blur_s**2 * speed
         total = own[:, None, None] * np.eye(8)
-        total = total + noise.arm**2 * linear.by_camera @ ARM_COVARIANCE @ linear.by_camera.transpose(0, 2, 1)
+        total = total + noise.arm**2 * linear.by_camera @ ARM_PER_IMAGE @ linear.by_camera.transpose(0, 2, 1)
         total += noise.jitter_s**2 * linear.by_time[:, :, None] * linear.by_time[:, None, :]
         return np.asarray(np.linalg.inv(total)), -np.asarray(np.linalg.slogdet(total)[1])
 

@@ -29,6 +29,7 @@ from fieldkit.scores import (
     summarize_run,
     weighted_median,
 )
+from fieldkit.trust import open_words, trust
 from fieldkit.types import Run, Trial, Truth, ViewResult
 
 # Up to this many tied views are shown one by one; more are summed up as an expectation.
@@ -135,7 +136,7 @@ def chapter(run: Run, number: int) -> Chapter:
         title=name,
         subtitle=_subtitle(run),
         facts=_provenance(run),
-        notes=tuple(TRUTH_NOTES[s] for s in TRUTH_NOTES if s in {t.source for _, t in run.truths}),
+        notes=_notes(run),
         protocol_json=json.dumps(protocols.to_dict(run.protocol), indent=2),
         thresholds=tuple(_words(t) for t in run.protocol.thresholds),
         pose=POSES[run.protocol.pose],
@@ -207,6 +208,18 @@ def _localizer_words(run: Run) -> str:
     rules = run.protocol.localizer
     bounds = f"reprojection {rules.max_reprojection_px:g} px, at least {rules.min_inliers} inliers"
     return f"{run.protocol.feature}, top {rules.top_k} retrieved, {bounds}"
+
+
+def _notes(run: Run) -> tuple[str, ...]:
+    """Return what must be known about the truth: where it comes from, what it leaves open, and where it is coarse."""
+    sources = {t.source for _, t in run.truths}
+    notes = [note for source, note in TRUTH_NOTES.items() if source in sources]
+    trusted = trust(run)
+    if trusted is not None:
+        notes.append(open_words(trusted, run.protocol.thresholds))
+        if trusted.warning:
+            notes.append(f"Caution: {trusted.warning}.")
+    return tuple(notes)
 
 
 def _truth_words(run: Run) -> str:

@@ -4,12 +4,15 @@ from fieldkit.tags.detect import FAMILIES, TagDetection, detect
 from fieldkit.tags.drawing import draw_tag
 from fieldkit.tags.fusion import Sighting, TagFix, fuse_sightings
 from fieldkit.tags.pose import TagSolution, solve, tag_corners
-from fieldkit.tags.sightings import ARM_COVARIANCE, BodySightings, body_in_map, body_sightings, fuse_body_sightings
+from fieldkit.tags.sightings import BodySighting, BodySightings, Place, body_sightings, frames_between, placed_tags
+from fieldkit.tags.standing import BodyFix, body_in_map, hand_covariance, image_covariance, locate_body
 
 __all__ = [
-    "ARM_COVARIANCE",
     "FAMILIES",
+    "BodyFix",
+    "BodySighting",
     "BodySightings",
+    "Place",
     "Sighting",
     "TagDetection",
     "TagFix",
@@ -18,8 +21,12 @@ __all__ = [
     "body_sightings",
     "detect",
     "draw_tag",
-    "fuse_body_sightings",
+    "frames_between",
     "fuse_sightings",
+    "hand_covariance",
+    "image_covariance",
+    "locate_body",
+    "placed_tags",
     "solve",
     "tag_corners",
 ]

@@ -1,4 +1,4 @@
-"""What the robot's arm camera sees of one tag: sightings relative to the body at one time."""
+"""What the robot's arm camera sees of tags: sightings, and where the body was at each relative to one time."""
 
 from __future__ import annotations
 
@@ -9,22 +9,59 @@ from collections.abc import Sequence
 import numpy as np
 
 from fieldkit.errors import FrameError, TagError
-from fieldkit.frames import Array, Pose, Trajectory, compose_covariance, inverse_covariance
-from fieldkit.tags.detect import detect
-from fieldkit.tags.fusion import SCALES, Sighting, TagFix, fuse_sightings
-from fieldkit.types import Frame, TagPose
+from fieldkit.frames import Array, Pose, Trajectory
+from fieldkit.odometry import PlacedTag, travel
+from fieldkit.protocol import OdometryNoise
+from fieldkit.tags.detect import TagDetection, detect
+from fieldkit.tags.pose import solve
+from fieldkit.types import Frame, Recording, SeenTag, TagPose
 
-# Noise of body_from_cam from joint angles, independent between images: 0.2 deg and 2 mm per axis. The fusion scales it
-# to what the sightings show
-ARM_COVARIANCE: Array = np.diag([math.radians(0.2) ** 2] * 3 + [0.002**2] * 3)
+# The body has made a step where odometry moved by more than this: less is jitter of a robot that stands
+STAND_M, STAND_RAD = 0.01, math.radians(0.5)
+# What odometry misses of any step: it does not see the body tilt, and nothing is certain
+STEP_FLOOR: Array = np.diag([math.radians(0.05) ** 2] * 3 + [0.0005**2] * 3)
+# Corner noise of recorded detections that state none: this, as if seen in so many sightings, and what their own
+# residuals say; nothing gets below the floor
+MESSAGE_SIGMA_PX, MESSAGE_WEIGHT, MESSAGE_FLOOR_PX = 0.3, 10, 0.05
+# Residual of the better planar solution over the other's above which a single image does not tell them apart
+DOUBTFUL = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """A frame relative to the body at the reference: ref_from_body by odometry, body_from_cam, its stand."""
+
+    frame: Frame
+    ref_from_body: Pose
+    body_from_cam: Pose
+    stand: int
+
+    @property
+    def ref_from_cam(self) -> Pose:
+        """The camera relative to the body at the reference."""
+        return self.ref_from_body * self.body_from_cam
+
+
+@dataclasses.dataclass(frozen=True)
+class BodySighting:
+    """A tag in one placed frame."""
+
+    detection: TagDetection
+    place: Place
 
 
 @dataclasses.dataclass(frozen=True)
 class BodySightings:
-    """Sightings of a tag relative to the body at ``t_ns``; how many frames were searched, and what was left out."""
+    """Sightings of tags relative to the body at ``t_ns``; how many frames were searched, and what was left out.
+
+    ``places`` are all frames with kinematics and odometry. The body moves between its stands only: ``steps`` holds for
+    each stand but the first the body at its begin, ref_from_body, and the 6x6 covariance of the step that led there.
+    """
 
     t_ns: int
-    sightings: tuple[Sighting, ...]
+    sightings: tuple[BodySighting, ...]
+    places: tuple[Place, ...]
+    steps: tuple[tuple[Pose, Array], ...]
     n_frames: int
     no_kinematics: int
     no_odometry: int
@@ -40,15 +77,51 @@ class BodySightings:
             parts.append(f"{self.no_odometry} without odometry ({self.last_error})")
         return ", ".join(parts)
 
+    def of(self, tag: TagPose) -> tuple[BodySighting, ...]:
+        """Return the sightings of one tag."""
+        return tuple(s for s in self.sightings if (s.detection.id, s.detection.family) == (tag.id, tag.family))
+
+
+def frames_between(recording: Recording, t_begin_ns: int, t_end_ns: int) -> list[Frame]:
+    """Return the images of an interval; recorded tag detections of it where it has no image."""
+    for frames in (recording.frames, recording.tag_frames):
+        inside = [f for f in frames if t_begin_ns <= f.t_ns <= t_end_ns]
+        if inside:
+            return inside
+    return []
+
+
+def placed_tags(frames: Sequence[Frame], tags: Sequence[TagPose]) -> list[PlacedTag]:
+    """Return each tag relative to the body by each frame alone, where its planar solution is beyond doubt."""
+    places = [Place(f, Pose.identity(), f.body_from_cam, 0) for f in frames if f.body_from_cam is not None]
+    sizes = {(tag.id, tag.family): tag.size_m for tag in tags}
+    found = []
+    for seen in _seen(places, tags):
+        size_m = sizes[seen.detection.id, seen.detection.family]
+        try:
+            own = solve(seen.detection, seen.place.frame.camera, size_m)
+        except (TagError, np.linalg.LinAlgError):
+            continue
+        if own.ambiguity < DOUBTFUL:
+            body_from_tag = seen.place.body_from_cam * own.cam_from_tag
+            found.append(PlacedTag(seen.place.frame.t_ns, seen.detection.id, body_from_tag, own.covariance))
+    return found
+
 
 def body_sightings(
-    frames: Sequence[Frame], tag: TagPose, *, odometry: Trajectory, max_frames: int = 60
+    frames: Sequence[Frame],
+    tags: Sequence[TagPose],
+    *,
+    odometry: Trajectory,
+    noise: OdometryNoise,
+    max_frames: int = 60,
 ) -> BodySightings:
-    """Find one tag in frames of a robot that stands or moves little, and place the cameras relative to its body.
+    """Find tags in frames of a robot that stands or moves little, and place the cameras relative to its body.
 
     The reference is the body at the last frame with kinematics and odometry. Motion between a frame and the
     reference comes from odometry deltas, never from its absolute pose. Of more than ``max_frames`` so many are
-    searched, evenly spread. An image that shows the same tag twice is left out.
+    searched, evenly spread. Frames whose tags were detected while recording are not searched. A tag that is twice in an
+    image is left out of it.
     """
     placed: list[tuple[Frame, Pose, Pose]] = []
     no_kinematics, no_odometry, last_error = 0, 0, ""
@@ -63,48 +136,78 @@ def body_sightings(
             no_odometry += 1
             last_error = error.message
     if not placed:
-        return BodySightings(0, (), len(chosen), no_kinematics, no_odometry, last_error)
+        return BodySightings(0, (), (), (), len(chosen), no_kinematics, no_odometry, last_error)
     reference = placed[-1][0].t_ns
+    stands, begins = _stands([pose for _, pose, _ in placed])
     ref_from_odom = odometry.at(reference).inv()
-    sightings = []
-    for frame, odom_from_body, body_from_cam in placed:
-        seen = [d for d in detect(frame.read(), frame.camera, families=(tag.family,)) if d.id == tag.id]
-        if len(seen) == 1:
-            ref_from_cam = ref_from_odom * odom_from_body * body_from_cam
-            sightings.append(Sighting(seen[0], frame.camera, ref_from_cam, ARM_COVARIANCE))
-    return BodySightings(reference, tuple(sightings), len(chosen), no_kinematics, no_odometry, last_error)
+    places = tuple(
+        Place(frame, ref_from_odom * pose, body_from_cam, stand)
+        for (frame, pose, body_from_cam), stand in zip(placed, stands, strict=True)
+    )
+    seen = _seen(places, tags)
+    times = [placed[i][0].t_ns for i in begins]
+    steps = tuple(
+        (places[i].ref_from_body, travel(odometry, before, places[i].frame.t_ns, noise=noise)[1] + STEP_FLOOR)
+        for before, i in zip(times, begins[1:], strict=False)
+    )
+    return BodySightings(reference, seen, places, steps, len(chosen), no_kinematics, no_odometry, last_error)
 
 
-def fuse_body_sightings(sightings: Sequence[Sighting], tag: TagPose) -> TagFix:
-    """Fuse what a robot's own camera saw of one tag into body_from_tag; see `fuse_sightings`.
-
-    Raises TagError when there is no solution, or when four or more sightings need the largest noise of the arm that
-    is allowed: a wrong tag size or wrong kinematics shifts all of them, and the covariance would not tell.
-    """
-    fix = fuse_sightings(sightings, tag.size_m)
-    if len(sightings) >= 4 and fix.scale >= max(SCALES):
-        raise TagError(
-            f"the {len(sightings)} sightings of tag {tag.id} disagree with kinematics by about {max(SCALES):g} times "
-            "their stated noise or more; expected one place of the tag in all of them",
-            hint="check size_m of the tag, camera_info and tf",
-        )
-    return fix
+def _stands(odom_from_body: Sequence[Pose]) -> tuple[list[int], list[int]]:
+    """Return the stand of every pose, and the index at which each stand begins."""
+    stands, begins = [], [0]
+    for index, pose in enumerate(odom_from_body):
+        moved = odom_from_body[begins[-1]].inv() * pose
+        if np.linalg.norm(moved.translation) > STAND_M or moved.rotation.magnitude() > STAND_RAD:
+            begins.append(index)
+        stands.append(len(begins) - 1)
+    return stands, begins
 
 
-def body_in_map(fix: TagFix, tag: TagPose) -> tuple[Pose, Array]:
-    """Return map_from_body and its covariance from the tag relative to the body and the tag in the map.
+def _seen(places: Sequence[Place], tags: Sequence[TagPose]) -> tuple[BodySighting, ...]:
+    wanted = {(tag.id, tag.family): tag for tag in tags}
+    families = tuple(dict.fromkeys(tag.family for tag in tags))
+    found: list[BodySighting] = []
+    for place in places:
+        frame = place.frame
+        if frame.tags is None:
+            detections = detect(frame.read(), frame.camera, families=families)
+        else:
+            detections = [d for tag in frame.tags if (d := _recorded(tag, tags)) is not None]
+        keys = [(d.id, d.family) for d in detections]
+        found += [
+            BodySighting(d, place)
+            for d, key in zip(detections, keys, strict=True)
+            if key in wanted and keys.count(key) == 1
+        ]
+    return _with_noise(found, wanted)
 
-    Where the sightings leave both planar solutions open, the one with the more upright body is taken: the map's z and
-    the body's z both point up on a standing robot. No odometry and no prior takes part in the choice.
-    """
-    options = [(fix.ref_from_tag, fix.covariance)]
-    if not fix.is_certain and fix.alternative is not None and fix.alternative_covariance is not None:
-        options.append((fix.alternative, fix.alternative_covariance))
-    ref_from_tag, covariance = min(options, key=lambda o: _tilt(tag.map_from_tag * o[0].inv()))
-    map_from_body = tag.map_from_tag * ref_from_tag.inv()
-    tag_from_ref = inverse_covariance(ref_from_tag, covariance)
-    return map_from_body, compose_covariance(tag.covariance, ref_from_tag.inv(), tag_from_ref)
+
+def _recorded(seen: SeenTag, tags: Sequence[TagPose]) -> TagDetection | None:
+    """Return a recorded detection of a tag that is wanted: by its id alone where the message names no family."""
+    for tag in tags:
+        if tag.id == seen.id and seen.family in (None, tag.family):
+            return TagDetection(
+                tag.id, tag.family, seen.corners_px, math.nan if seen.sigma_px is None else seen.sigma_px
+            )
+    return None
 
 
-def _tilt(map_from_body: Pose) -> float:
-    return float(np.arccos(np.clip(map_from_body.rotation.as_matrix()[2, 2], -1.0, 1.0)))
+def _with_noise(found: Sequence[BodySighting], tags: dict[tuple[int, str], TagPose]) -> tuple[BodySighting, ...]:
+    """Give detections of unknown noise the one that their own residuals show: 8 coordinates fit 6 parameters."""
+    unknown = [s for s in found if math.isnan(s.detection.sigma_px)]
+    squares, count = MESSAGE_WEIGHT * 2 * MESSAGE_SIGMA_PX**2, MESSAGE_WEIGHT * 2
+    for sighting in unknown:
+        detection = dataclasses.replace(sighting.detection, sigma_px=MESSAGE_SIGMA_PX)
+        try:
+            own = solve(detection, sighting.place.frame.camera, tags[detection.id, detection.family].size_m)
+        except (TagError, np.linalg.LinAlgError):
+            continue
+        squares, count = squares + 8 * min(own.rms_px, 10 * MESSAGE_SIGMA_PX) ** 2, count + 2
+    sigma = max(math.sqrt(squares / count), MESSAGE_FLOOR_PX)
+    return tuple(
+        s
+        if not math.isnan(s.detection.sigma_px)
+        else dataclasses.replace(s, detection=dataclasses.replace(s.detection, sigma_px=sigma))
+        for s in found
+    )
