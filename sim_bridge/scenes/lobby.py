@@ -48,7 +48,7 @@ _NORTH = ((LENGTH_M, WIDTH_M), (0.0, WIDTH_M))
 _WEST = ((0.0, WIDTH_M), (0.0, 0.0))
 _WAITING_SOUTH = ((0.0, GATES_Y), (WAITING_X, GATES_Y))
 _WAITING_EAST = ((WAITING_X, GATES_Y), (WAITING_X, WIDTH_M))
-_CLOAKS = SideRoom((-3.4, 3.1, -0.06, 6.1), EAST, ((-1.35, 4.2), (-1.35, 6.1)), 2.6)
+_CLOAKS = SideRoom((-3.4, 3.1, -0.06, 6.1), EAST, ((-1.35, 4.2), (-1.35, 6.1)), 2.6, threshold_m=0.06)
 _CLOAKS_DOOR = Opening(WIDTH_M - 5.5, 1.1)
 _PILLARS = ((3.3, 3.1), (8.3, 3.6), (5.45, GATES_Y))
 

@@ -31,19 +31,21 @@ class Finish:
 class SideRoom:
     """The floor's rectangle (x0, y0, x1, y1), the side on which the hall lies, and the screen wall's line in plan.
 
-    ``rect`` ends at the outer face of the hall's wall, in which the hall itself leaves an opening for the door.
+    ``rect`` ends at the outer face of the hall's wall, in which the hall itself leaves an opening for the door. The
+    hall's own floor ends ``threshold_m`` before it.
     """
 
     rect: Rect
     hall: int
     screen: tuple[tuple[float, float], tuple[float, float]]
     height_m: float
+    threshold_m: float = THICKNESS_M
 
     @property
     def floor(self) -> Rect:
-        """The rectangle with the threshold in the hall's wall."""
+        """The rectangle with the threshold in the opening."""
         x0, y0, x1, y1 = self.rect
-        reach = dict.fromkeys(range(4), 0.0) | {self.hall: THICKNESS_M}
+        reach = dict.fromkeys(range(4), 0.0) | {self.hall: self.threshold_m}
         return x0 - reach[WEST], y0 - reach[SOUTH], x1 + reach[EAST], y1 + reach[NORTH]
 
 
