@@ -5,7 +5,7 @@ The plan, in metres, with x to the east (0..12.4) and y to the north (0..9):
              +----------------+-- lift --- lift --- lift --+   9.0
              | waiting room   |                            |
     +--------+---------   ----+ o  gate gate gate gate gate|   6.3
-    | cloak- |                                             |
+    | cloak-                                               |
     |  room  | counter  o    sofas                display  |
     +--------+   |           sofas    o                    |
              |                              sofa  table  sofa

@@ -12,19 +12,19 @@ from sim_bridge.scenes.blueprint import Builder
 from sim_bridge.scenes.halls import EAST, NORTH, SOUTH, WEST, lamps
 from sim_bridge.scenes.plan import THICKNESS_M, Rect, slab, wall
 
+TILE_M = (2.4, 2.4)
 _HALF = THICKNESS_M / 2
 _LAMP_M = (0.6, 0.6)
 
 
 @dataclasses.dataclass(frozen=True)
 class Finish:
-    """Texture numbers of a side room's walls, floor (tiles of floor_m) and ceiling (tiles of 2.4 m), and skirting."""
+    """Texture numbers of a side room's walls, floor and ceiling (both in tiles of TILE_M), and skirting."""
 
     walls: int
     floor: int
     ceiling: int
-    trim: int | None
-    floor_m: float = 2.4
+    trim: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,9 +62,8 @@ def side_room(build: Builder, room: SideRoom, finish: Finish, *, lamp_power: flo
         if side != room.hall:
             wall(build, *line, height_m=room.height_m, left=finish.walls, right=None, trim=finish.trim)
     wall(build, *room.screen, height_m=room.height_m, left=finish.walls, right=finish.walls, trim=finish.trim)
-    tile = (finish.floor_m, finish.floor_m)
-    slab(build, room.floor, z_m=0.0, texture=finish.floor, up=True, cell_m=0.14, tile_m=tile)
-    slab(build, room.rect, z_m=room.height_m, texture=finish.ceiling, up=False, cell_m=0.6, tile_m=(2.4, 2.4))
+    slab(build, room.floor, z_m=0.0, texture=finish.floor, up=True, cell_m=0.14, tile_m=TILE_M)
+    slab(build, room.rect, z_m=room.height_m, texture=finish.ceiling, up=False, cell_m=0.6, tile_m=TILE_M)
     if room.hall in (EAST, WEST):
         spots = [(x0 + share * (x1 - x0), (y0 + y1) / 2) for share in (0.25, 0.75)]
     else:
