@@ -159,7 +159,7 @@ def test_other_settings_are_refused_by_name(whole: Path) -> None:
 def test_a_folder_of_something_else_or_a_run_at_work_is_refused(tmp_path: Path, whole: Path) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "text.txt").write_text("mine")
-    with pytest.raises(StoreError, match=r"notes: exists already"):
+    with pytest.raises(StoreError, match=r"notes: holds no dataset.toml, so --force does not replace it"):
         make(tmp_path / "notes", force=True)
     with pytest.raises(StoreError, match=r"text.txt: is a file; expected a folder"):
         make(tmp_path / "notes" / "text.txt")

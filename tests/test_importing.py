@@ -117,10 +117,11 @@ def test_points_without_faces_are_refused(tmp_path: Path) -> None:
         import_scene(path)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
-def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path, kind: str) -> None:
+def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path, kind: str, value: float) -> None:
     mesh = trimesh.util.concatenate(coloured(shell(), (9, 9, 9)))
-    mesh.vertices[3, 1] = np.nan
+    mesh.vertices[3, 1] = value
     path = tmp_path / f"room.{kind}"
     mesh.export(path)
     with pytest.raises(SynthesisError, match=rf"room.{kind}: .*1 of \d+ vertices are not finite; expected numbers"):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
@@ -30,16 +31,19 @@ from fieldkit.maps.io import (
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
 from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
 from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
-from fieldkit.maps.plausible import SlamRules, plausible_matches
-from fieldkit.maps.sfm import reconstruct, threads
+from fieldkit.maps.plausible import SlamRules, plausible_matches, plausible_pairs
+from fieldkit.maps.sfm import reconstruct, relative_poses, threads
 from fieldkit.maps.source import DepthFrame, MapSource, read_source
-from fieldkit.maps.strays import strays
+from fieldkit.maps.strays import contradicting, strays
 from fieldkit.store import atomic_folder
 from fieldkit.store.files import refuse_existing
 from fieldkit.surface import fuse_depth, write_ply
 from fieldkit.types import Surface
 
 Progress = Callable[[str, int, int], None]
+
+# A few misplaced images are left out; of more than this share the rest is bent too, and SfM starts again.
+_FOLDED = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,12 +133,13 @@ def build_map(
     clock.lap("extract")
     pairs, matches, disbelieved = _match_all(walk, features, options, seed, tell)
     clock.lap("match")
-    model = reconstruct(
-        walk.images, features, pairs, matches, seed=seed, progress=tell, n_threads=options.n_threads or threads()
-    )
+    found = _Matched(walk, features, pairs, matches)
+    placing = _place(found, options, seed, tell)
+    if options.slam is not None and not disbelieved and placing.contradicting > _FOLDED * len(placing.sfm_poses):
+        again = _place(_unfolded(found, options.slam, options, seed), options, seed, tell)
+        placing = max(placing, again, key=lambda p: len(p.sfm_poses) - p.contradicting)
     clock.lap("reconstruct")
-    sfm_poses = _registered(walk, model, options)
-    alignment, warnings = _align(walk, model, sfm_poses, options, seed)
+    model, sfm_poses, alignment, warnings = placing.model, placing.sfm_poses, placing.alignment, placing.warnings
     mapped, left_out = _placed(walk, model, sfm_poses, alignment)
     n_landmarks = _finish_model(walk, model, alignment.map_from_sfm, options.landmarks)
     clock.lap("align")
@@ -147,8 +152,8 @@ def build_map(
         places = _alignment_entry(alignment), _surface_entry(surface, options)
         write_map_file(folder, MapFile(1, digest, feature, *counts, *places))
     clock.lap("write")
-    found = (*disbelieved, *warnings, *left_out, *missing)
-    return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, found)
+    told = (*disbelieved, *warnings, *left_out, *missing)
+    return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, told)
 
 
 def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progress) -> list[Features]:
@@ -192,6 +197,63 @@ def _match_all(
     if share < options.slam.least_share:
         return pairs, matches, [f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"]
     return pairs, plausible, []
+
+
+@dataclasses.dataclass(frozen=True)
+class _Matched:
+    """What SfM starts from."""
+
+    walk: MapSource
+    features: Sequence[Features]
+    pairs: Sequence[Pair]
+    matches: Sequence[NDArray[np.uint32]]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Placing:
+    """A model with its poses sfm_from_cam, its alignment, and how many images are not where SLAM saw them."""
+
+    model: pycolmap.Reconstruction
+    sfm_poses: Mapping[int, Pose]
+    alignment: Alignment
+    warnings: Sequence[str]
+    contradicting: int
+
+
+def _place(found: _Matched, options: MapOptions, seed: int, tell: Progress) -> _Placing:
+    walk = found.walk
+    model = reconstruct(
+        walk.images,
+        found.features,
+        found.pairs,
+        found.matches,
+        seed=seed,
+        progress=tell,
+        n_threads=options.n_threads or threads(),
+    )
+    poses = _registered(walk, model, options)
+    alignment, warnings = _align(walk, model, poses, options, seed)
+    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in poses.items()}
+    far = contradicting(walk.images, mapped, threshold_m=alignment.threshold_m)
+    return _Placing(model, poses, alignment, warnings, len(far))
+
+
+def _unfolded(found: _Matched, rules: SlamRules, options: MapOptions, seed: int) -> _Matched:
+    """Leave out the pairs of images whose own relative poses contradict SLAM's."""
+    relative = relative_poses(
+        found.walk.images,
+        found.features,
+        found.pairs,
+        found.matches,
+        seed=seed,
+        n_threads=options.n_threads or threads(),
+    )
+    kept = plausible_pairs(found.walk.images, found.pairs, relative, rules=rules)
+    return dataclasses.replace(
+        found,
+        pairs=list(itertools.compress(found.pairs, kept)),
+        matches=list(itertools.compress(found.matches, kept)),
+    )
 
 
 def _registered(walk: MapSource, model: pycolmap.Reconstruction, options: MapOptions) -> dict[int, Pose]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Features
+from fieldkit.frames import Pose
 from fieldkit.maps.order import walk_order
 from fieldkit.maps.pairs import Pair
 from fieldkit.maps.source import SourceImage
@@ -24,6 +25,9 @@ class SlamRules:
     ``drift_per_m`` of the way walked in between; points lie ``nearest_m`` to ``farthest_m`` away, and nothing looks
     the same from directions more than ``widest_deg`` apart: opposite shelves do. Poses that fit less than
     ``least_share`` of all matches are wrong themselves and rule out nothing.
+    Where a map folds nevertheless, pairs of images lose all their matches when the relative pose that these alone give
+    is turned by more than ``pair_rotation_deg`` against SLAM's, or, for images ``pair_baseline_m`` apart, points
+    ``pair_direction_deg`` elsewhere.
     """
 
     rotation_deg: float = 3.0
@@ -33,6 +37,9 @@ class SlamRules:
     farthest_m: float = 15.0
     widest_deg: float = 60.0
     least_share: float = 0.5
+    pair_rotation_deg: float = 8.0
+    pair_direction_deg: float = 25.0
+    pair_baseline_m: float = 0.8
 
 
 def plausible_matches(
@@ -59,6 +66,27 @@ def plausible_matches(
         y = _unit(second.rotation.apply(rays[b][found[:, 1]]))
         error_m = rules.position_m + rules.drift_per_m * abs(walked[a] - walked[b])
         result.append(found[_meet(x, y, second.translation - first.translation, error_m, rules)])
+    return result
+
+
+def plausible_pairs(
+    images: Sequence[SourceImage], pairs: Sequence[Pair], relative: Sequence[Pose | None], *, rules: SlamRules
+) -> NDArray[np.bool_]:
+    """Tell of every pair (a, b) whether its own relative pose, b_from_a up to scale, agrees with SLAM's, as bool[n].
+
+    Pairs without a relative pose, or of images without a SLAM pose, agree.
+    """
+    result = np.ones(len(pairs), dtype=bool)
+    for k, ((a, b), found) in enumerate(zip(pairs, relative, strict=True)):
+        first, second = images[a].slam_from_cam, images[b].slam_from_cam
+        if found is None or first is None or second is None:
+            continue
+        b_from_a = second.inv() * first
+        turned = (found.rotation * b_from_a.rotation.inv()).magnitude()
+        result[k] = turned <= np.radians(rules.pair_rotation_deg)
+        if np.linalg.norm(b_from_a.translation) > rules.pair_baseline_m:
+            cosine = float(_unit(found.translation[None])[0] @ _unit(b_from_a.translation[None])[0])
+            result[k] &= cosine >= np.cos(np.radians(rules.pair_direction_deg))
     return result
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fieldkit.errors import MapError
 from fieldkit.features import Features
+from fieldkit.frames import Pose
 from fieldkit.maps.pairs import Pair
 from fieldkit.maps.rigs import write_cameras
 from fieldkit.maps.source import SourceImage
@@ -50,21 +51,47 @@ def write_database(
                 database.write_matches(a + 1, b + 1, found_matches)
 
 
-def verify_geometry(path: Path, *, seed: int, n_threads: int = -1) -> int:
+def verify_geometry(path: Path, *, seed: int, n_threads: int = -1, with_pose: bool = False) -> int:
     """Verify all matches of a database by two-view geometry; return the number of pairs that hold.
 
-    Pairs are shared among ``n_threads`` threads, -1 for all processors; what is found does not depend on it.
+    Pairs are shared among ``n_threads`` threads, -1 for all processors; what is found does not depend on it. The
+    relative pose of each pair is found too when asked for.
     """
     sharing = pycolmap.GeometricVerifierOptions()
     sharing.num_threads = n_threads
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = _MIN_MATCHES
     options.detect_watermark = False
+    options.compute_relative_pose = with_pose
     options.ransac.random_seed = seed
     options.ransac.num_threads = 1
     pycolmap.geometric_verification(path, sharing, two_view_geometry_options=options)
     with contextlib.closing(pycolmap.Database.open(path)) as database:
         return int(database.num_verified_image_pairs())
+
+
+def relative_poses(
+    images: Sequence[SourceImage],
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+    matches: Sequence[NDArray[np.uint32]],
+    *,
+    seed: int,
+    n_threads: int = -1,
+) -> list[Pose | None]:
+    """Return b_from_a of every pair (a, b) by its matches alone, up to scale; None where they give none."""
+    found: dict[Pair, Pose] = {}
+    with tempfile.TemporaryDirectory(prefix="fieldkit-sfm-") as folder, quiet_colmap():
+        path = Path(folder) / "database.db"
+        write_database(path, images, features, pairs, matches)
+        verify_geometry(path, seed=seed, n_threads=n_threads, with_pose=True)
+        with contextlib.closing(pycolmap.Database.open(path)) as database:
+            for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+                a, b = pycolmap.pair_id_to_image_pair(pair_id)
+                if (b_from_a := geometry.cam2_from_cam1) is not None:
+                    pose = Pose.from_matrix(np.vstack([b_from_a.matrix(), [0.0, 0.0, 0.0, 1.0]]))
+                    found[a - 1, b - 1], found[b - 1, a - 1] = pose, pose.inv()
+    return [found.get(pair) for pair in pairs]
 
 
 def reconstruct(

@@ -21,15 +21,13 @@ _MIN_M = 0.3
 def strays(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, threshold_m: float) -> list[int]:
     """Return the images (by index) whose mapped position contradicts SLAM's, and whose walk leaps in the map.
 
-    An image contradicts when its residual exceeds three times ``threshold_m``, the bound of the alignment, and 0.3 m.
     Whether SfM or SLAM is wrong there is told by the way from the last to the next image of its sequence that does
     not contradict: the longer detour is the wrong one. With one image of a rig's frame all of the frame are returned.
     """
     posed = [i for i in map_from_cam if images[i].slam_from_cam is not None]
     mapped = {i: np.asarray(map_from_cam[i].translation) for i in posed}
     slam = {i: _position(images[i]) for i in posed}
-    bound = max(_BEYOND * threshold_m, _MIN_M)
-    far = {i for i in posed if np.linalg.norm(mapped[i] - slam[i]) > bound}
+    far = contradicting(images, map_from_cam, threshold_m=threshold_m)
     sequences: dict[str, list[int]] = {}
     for i in posed:
         sequences.setdefault(images[i].sequence, []).append(i)
@@ -44,6 +42,19 @@ def strays(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, t
     frames = {images[i].frame for i in wrong if images[i].rig_from_cam is not None}
     together = {i for i in map_from_cam if images[i].rig_from_cam is not None and images[i].frame in frames}
     return sorted(wrong | together)
+
+
+def contradicting(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, threshold_m: float) -> set[int]:
+    """Return the images (by index) whose mapped position contradicts SLAM's.
+
+    Their residual exceeds three times ``threshold_m``, the bound of the alignment, and 0.3 m.
+    """
+    bound, far = max(_BEYOND * threshold_m, _MIN_M), set()
+    for i, mapped in map_from_cam.items():
+        if images[i].slam_from_cam is not None:
+            residual_m = float(np.linalg.norm(mapped.translation - _position(images[i])))
+            far |= {i} if residual_m > bound else set()
+    return far
 
 
 def _position(image: SourceImage) -> Array:

@@ -209,7 +209,9 @@ def _parts(scene: trimesh.Scene, file: _File) -> Iterator[Part]:
         if not isinstance(mesh, trimesh.Trimesh):
             continue
         matrix = np.asarray(file_from_part, dtype=np.float64)
-        vertices = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        # What is not finite is refused with the whole scene, in one line.
+        with np.errstate(invalid="ignore"):
+            vertices = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         wanted = np.asarray(mesh.faces).reshape(-1, 3)
         _check_corners(file.path, wanted, len(vertices))
         faces = np.ascontiguousarray(wanted, dtype=np.int32)

@@ -5,7 +5,7 @@ The plan, in metres, with x to the east (0..12.4) and y to the north (0..9):
              +----------------+-- lift --- lift --- lift --+   9.0
              | waiting room   |                            |
     +--------+---------   ----+ o  gate gate gate gate gate|   6.3
-    | cloak- |                                             |
+    | cloak-                                               |
     |  room  | counter  o    sofas                display  |
     +--------+   |           sofas    o                    |
              |                              sofa  table  sofa
@@ -48,7 +48,7 @@ _NORTH = ((LENGTH_M, WIDTH_M), (0.0, WIDTH_M))
 _WEST = ((0.0, WIDTH_M), (0.0, 0.0))
 _WAITING_SOUTH = ((0.0, GATES_Y), (WAITING_X, GATES_Y))
 _WAITING_EAST = ((WAITING_X, GATES_Y), (WAITING_X, WIDTH_M))
-_CLOAKS = SideRoom((-3.4, 3.1, -0.06, 6.1), EAST, ((-1.35, 4.2), (-1.35, 6.1)), 2.6)
+_CLOAKS = SideRoom((-3.4, 3.1, -0.06, 6.1), EAST, ((-1.35, 4.2), (-1.35, 6.1)), 2.6, threshold_m=0.06)
 _CLOAKS_DOOR = Opening(WIDTH_M - 5.5, 1.1)
 _PILLARS = ((3.3, 3.1), (8.3, 3.6), (5.45, GATES_Y))
 

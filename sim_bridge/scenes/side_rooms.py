@@ -12,38 +12,40 @@ from sim_bridge.scenes.blueprint import Builder
 from sim_bridge.scenes.halls import EAST, NORTH, SOUTH, WEST, lamps
 from sim_bridge.scenes.plan import THICKNESS_M, Rect, slab, wall
 
+TILE_M = (2.4, 2.4)
 _HALF = THICKNESS_M / 2
 _LAMP_M = (0.6, 0.6)
 
 
 @dataclasses.dataclass(frozen=True)
 class Finish:
-    """Texture numbers of a side room's walls, floor (tiles of floor_m) and ceiling (tiles of 2.4 m), and skirting."""
+    """Texture numbers of a side room's walls, floor and ceiling (both in tiles of TILE_M), and skirting."""
 
     walls: int
     floor: int
     ceiling: int
-    trim: int | None
-    floor_m: float = 2.4
+    trim: int
 
 
 @dataclasses.dataclass(frozen=True)
 class SideRoom:
     """The floor's rectangle (x0, y0, x1, y1), the side on which the hall lies, and the screen wall's line in plan.
 
-    ``rect`` ends at the outer face of the hall's wall, in which the hall itself leaves an opening for the door.
+    ``rect`` ends at the outer face of the hall's wall, in which the hall itself leaves an opening for the door. The
+    hall's own floor ends ``threshold_m`` before it.
     """
 
     rect: Rect
     hall: int
     screen: tuple[tuple[float, float], tuple[float, float]]
     height_m: float
+    threshold_m: float = THICKNESS_M
 
     @property
     def floor(self) -> Rect:
-        """The rectangle with the threshold in the hall's wall."""
+        """The rectangle with the threshold in the opening."""
         x0, y0, x1, y1 = self.rect
-        reach = dict.fromkeys(range(4), 0.0) | {self.hall: THICKNESS_M}
+        reach = dict.fromkeys(range(4), 0.0) | {self.hall: self.threshold_m}
         return x0 - reach[WEST], y0 - reach[SOUTH], x1 + reach[EAST], y1 + reach[NORTH]
 
 
@@ -60,9 +62,8 @@ def side_room(build: Builder, room: SideRoom, finish: Finish, *, lamp_power: flo
         if side != room.hall:
             wall(build, *line, height_m=room.height_m, left=finish.walls, right=None, trim=finish.trim)
     wall(build, *room.screen, height_m=room.height_m, left=finish.walls, right=finish.walls, trim=finish.trim)
-    tile = (finish.floor_m, finish.floor_m)
-    slab(build, room.floor, z_m=0.0, texture=finish.floor, up=True, cell_m=0.14, tile_m=tile)
-    slab(build, room.rect, z_m=room.height_m, texture=finish.ceiling, up=False, cell_m=0.6, tile_m=(2.4, 2.4))
+    slab(build, room.floor, z_m=0.0, texture=finish.floor, up=True, cell_m=0.14, tile_m=TILE_M)
+    slab(build, room.rect, z_m=room.height_m, texture=finish.ceiling, up=False, cell_m=0.6, tile_m=TILE_M)
     if room.hall in (EAST, WEST):
         spots = [(x0 + share * (x1 - x0), (y0 + y1) / 2) for share in (0.25, 0.75)]
     else:

@@ -1,0 +1,70 @@
+"""Maps fold where rooms look alike: pairs of images whose own relative pose contradicts SLAM's are told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from synthetic_map import CAMERA, looking
+
+from fieldkit.features import Features
+from fieldkit.frames import Pose, exp
+from fieldkit.maps.plausible import SlamRules, plausible_pairs
+from fieldkit.maps.sfm import relative_poses
+from fieldkit.maps.source import SourceImage
+from fieldkit.maps.strays import contradicting
+
+PLACES = [looking(np.array([x, 0.0, 1.5]), np.pi / 2) for x in (0.0, 1.0)]
+ELSEWHERE = PLACES[1] * exp([0.0, 0.0, 0.0, 0.0, 0.0, 3.0])
+TURNED = PLACES[1] * exp([0.0, np.radians(12.0), 0.0, 0.0, 0.0, 0.0])
+
+
+def own_pose(rng: np.random.Generator, *, pair: tuple[int, int] = (0, 1), n_matches: int = 150) -> Pose | None:
+    """Let COLMAP find the relative pose of two images of one room from their keypoints alone."""
+    points = rng.uniform([-0.5, 2.5, 0.8], [1.5, 5.0, 2.2], (150, 3))
+    images, seen = [], []
+    for k, place in enumerate(PLACES):
+        pixels, _ = CAMERA.project(place.inv().apply(points))
+        pixels = pixels + rng.normal(0.0, 0.3, pixels.shape)
+        unused = np.zeros(len(points), np.float32)
+        seen.append(Features(pixels.astype(np.float32), unused, unused, np.zeros((len(points), 128), np.float32)))
+        images.append(SourceImage(f"{k}.jpg", Path(), CAMERA, "", str(k), None))
+    matches = np.arange(n_matches, dtype=np.uint32)[:, None].repeat(2, axis=1)
+    (found,) = relative_poses(images, seen, [pair], [matches], seed=0)
+    return found
+
+
+def agrees(slam: list[Pose | None], b_from_a: Pose | None) -> bool:
+    images = [SourceImage(f"{k}.jpg", Path(), CAMERA, "", str(k), pose) for k, pose in enumerate(slam)]
+    (agreed,) = plausible_pairs(images, [(0, 1)], [b_from_a], rules=SlamRules()).tolist()
+    return bool(agreed)
+
+
+def test_a_pair_stays_where_slam_saw_it_and_goes_where_slam_was_elsewhere(rng: np.random.Generator) -> None:
+    relative = own_pose(rng)
+    assert relative is not None
+    drifted = PLACES[1] * exp([0.0, 0.02, 0.0, 0.1, 0.0, 0.1])
+    assert agrees([*PLACES], relative)
+    assert agrees([PLACES[0], drifted], relative)
+    assert not agrees([PLACES[0], ELSEWHERE], relative)
+    assert not agrees([PLACES[0], TURNED], relative)
+    assert agrees([PLACES[0], None], relative)
+    assert agrees([PLACES[0], ELSEWHERE], None)
+
+
+def test_the_relative_pose_of_a_pair_follows_its_order_and_needs_enough_matches(rng: np.random.Generator) -> None:
+    forth, back = own_pose(rng), own_pose(rng, pair=(1, 0))
+    assert forth is not None
+    assert back is not None
+    step = PLACES[1].inv() * PLACES[0]
+    assert forth.translation @ step.translation > 0.99
+    assert back.translation @ step.inv().translation > 0.99
+    assert own_pose(rng, n_matches=10) is None
+
+
+def test_an_image_contradicts_where_it_is_farther_from_slam_than_drift_goes() -> None:
+    images = [SourceImage(f"{k}.jpg", Path(), CAMERA, "", str(k), pose) for k, pose in enumerate(PLACES)]
+    images.append(SourceImage("2.jpg", Path(), CAMERA, "", "2", None))
+    mapped = {0: PLACES[0], 1: ELSEWHERE, 2: ELSEWHERE}
+    assert contradicting(images, mapped, threshold_m=0.05) == {1}
+    assert contradicting(images, mapped, threshold_m=1.1) == set()
