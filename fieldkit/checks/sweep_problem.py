@@ -50,9 +50,9 @@ _TAG_STEP = 1e-5
 class Noise:
     """What residuals may be made of beside the corners' own noise; a still arm shows only the first.
 
-    ``arm`` is the factor of the arm's stated standard deviations in one image (`ArmNoise`). ``jitter_s``: an image is taken at
-    another time than stated, or between samples of an arm that does not move evenly. ``blur_s``: corners of a moving
-    image err by so many seconds of its motion, each by itself.
+    ``arm`` is the factor of the arm's stated standard deviations in one image (`ArmNoise`). ``jitter_s``: an image is
+    taken at another time than stated, or between samples of an arm that does not move evenly. ``blur_s``: corners of a
+    moving image err by so many seconds of its motion, each by itself.
     """
 
     arm: float = 1.0
