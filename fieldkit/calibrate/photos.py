@@ -15,7 +15,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
 from fieldkit.store import read_camera, read_photos
 from fieldkit.tags import TagDetection, detect
-from fieldkit.tags.drawing import family_cells
+from fieldkit.tags.families import FAMILIES
 from fieldkit.types import Image, TagPhoto
 
 Progress = Callable[[str, int, int], None]
@@ -23,8 +23,6 @@ Progress = Callable[[str, int, int], None]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 # Cells of fewer pixels are mixed by the lens: their edges, and with them the corners, shift
 MIN_CELL_PX = 3.0
-# Cells across a tag of a family without a closed black square
-PLAIN_CELLS = 8
 # Edges are read half a cell to either side. In renders the corners err by more than three of their stated sigmas once
 # the blur exceeds this share of a cell: the neighbours come in
 MAX_BLUR_CELLS = 0.3
@@ -203,7 +201,7 @@ def _why_not(
         return "no size given for this tag"
     if [d.id for d in found].count(detection.id) > 1:
         return "the same id is seen twice in the photo"
-    cell_px = detection.edge_px / (family_cells(detection.family) or PLAIN_CELLS)
+    cell_px = detection.edge_px / FAMILIES[detection.family].cells
     if cell_px < MIN_CELL_PX:
         edge = math.ceil(detection.edge_px * MIN_CELL_PX / cell_px)
         return f"the tag is too small: {detection.edge_px:.0f} px; expected an edge of at least {edge} px"

@@ -85,7 +85,7 @@ def write_sheets(path: Path, ids: Sequence[int], *, size_m: float, family: str, 
 
 
 def _layout(size_m: float, *, family: str, paper: str) -> _Page:
-    cells = DRAWN_FAMILIES[family][1]
+    cells = DRAWN_FAMILIES[family]
     edge = 1e3 * size_m
     if not math.isfinite(edge) or edge < SMALLEST_CELL_MM * cells:
         raise TagError(
@@ -110,7 +110,7 @@ def largest_mm(family: str, paper: str) -> float:
     """Return the edge length in mm of the largest tag of a family that fits a paper."""
     width, height = PAPERS[paper]
     room = min(width - 2 * MARGIN_MM, height - HEADER_MM - FOOTER_MM)
-    return room / (1 + 2 * QUIET_CELLS / DRAWN_FAMILIES[family][1])
+    return room / (1 + 2 * QUIET_CELLS / DRAWN_FAMILIES[family])
 
 
 def _length(value_mm: float) -> str:
