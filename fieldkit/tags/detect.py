@@ -86,11 +86,12 @@ def _refine(grey: Image, camera: Camera, family: Family, found: FoundTag) -> Tag
     fit = fit_square(grey, camera, found.corners_px, family.cells, is_reversed=family.is_reversed)
     if fit is not None and _moved(camera, fit, found) > limit:
         fit = None
-    if fit is None or fit.blur_px > EDGE_BLUR_CELLS * cell_px(bend(camera, fit.flat), family.cells):
-        start = fit or CornerFit(flatten(camera, found.corners_px), np.eye(8), SHARP_BLUR_PX)
-        fit = fit_pattern(grey, camera, family, found.id, start)
-        if fit is None or _moved(camera, fit, found) > limit:
-            return coarse
+    start = fit or CornerFit(flatten(camera, found.corners_px), np.eye(8), SHARP_BLUR_PX)
+    whole = fit_pattern(grey, camera, family, found.id, start)
+    if whole is not None and _moved(camera, whole, found) <= limit:
+        fit = whole
+    if fit is None:
+        return coarse
     covariance = bent_covariance(camera, fit.flat, fit.covariance) + UNSEEN_SIGMA_PX**2 * np.eye(8)
     sigma = float(np.sqrt(np.trace(covariance) / 8))
     return dataclasses.replace(coarse, corners_px=bend(camera, fit.flat), sigma_px=sigma, covariance_px=covariance)

@@ -114,11 +114,16 @@ def edge_points(grey: Image, corners: Array, i: int, cells: int, *, is_reversed:
     good = inside & (contrast > max(12.0, 0.5 * float(np.median(contrast))))
     middle = (places[1:] + places[:-1]) / 2
     points: Array = (rise[..., None] * middle).sum(axis=0)[good] / contrast[good, None]
-    spread = (rise * np.square(middle - (rise[..., None] * middle).sum(axis=0) / contrast[:, None]).sum(axis=2)).sum(
-        axis=0
-    )
-    blur = float(np.sqrt(max(np.median(spread[good] / contrast[good]), 0.0))) if good.any() else 0.0
-    return points, blur
+    return points, _blur(rise[:, good], middle[:, good], points, quad[1] - quad[0])
+
+
+def _blur(rise: Array, middle: Array, points: Array, along: Array) -> float:
+    """Return the standard deviation of the edge's profile at right angles to it, in pixels."""
+    if len(points) == 0:
+        return 0.0
+    normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
+    variance = (rise * ((middle - points) @ normal) ** 2).sum(axis=0) / rise.sum(axis=0)
+    return float(np.sqrt(max(float(np.median(variance)), 0.0)))
 
 
 def _apply(homography: Array, points: ArrayLike) -> Array:

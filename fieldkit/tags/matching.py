@@ -16,15 +16,22 @@ from fieldkit.tags.lens import bend, bend_slope, flatten
 from fieldkit.types import Image
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 # What lies farther outside of the square than this share of a cell is not compared: the margin may end there
 OUTSIDE_CELLS = 0.5
-# Of a large tag so many pixels are compared
-MAX_PIXELS = 6000
-# Gauss-Hermite nodes for the part of the blur that is not along the tag's axes
-NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
+# Pixels times nodes of the blur that are computed: of a large tag every second or third pixel is compared
+MAX_SAMPLES = 40000
+# Most nodes for the part of the blur that is not along the tag's axes, and how far they reach in its deviations
+MAX_NODES, NODE_REACH = 31, 3.5
+# Only pixels that are nearer to an edge of a cell than so many deviations of the blur tell where it is
+NEAR_BLURS, NEAR_PX = 3.0, 1.5
 # Light that changes across the tag: constant and two slopes for black, the same for white, and what lies beyond it
 N_LIGHT = 7
+# Corners, blur and tone
+N_SHAPE = 10
+# Reflectance of black over that of white; tones between 1 (blur acts on grey values) and 0.45 (on light, as in a lens)
+BLACK, MIN_TONE, MAX_TONE = 0.05, 0.2, 2.0
 # A residual of more than this share of the contrast is no picture of this tag
 MAX_MISFIT = 0.2
 
@@ -36,69 +43,92 @@ class _Patch:
     values: Array
     flat: Array
     flat_by_pixel: Array
-    where: tuple[NDArray[np.intp], NDArray[np.intp]]
+    rows: Ints
+    columns: Ints
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shape:
+    """What is fitted beside the light: corners (4, 2) in undistorted pixels, log of the blur in pixels, and the tone."""
+
+    corners: Array
+    log_blur: float
+    tone: float
+
+    def moved(self, step: Array) -> _Shape:
+        log_blur = self.log_blur + float(np.clip(step[8], -0.5, 0.5))
+        tone = float(np.clip(self.tone + np.clip(step[9], -0.3, 0.3), MIN_TONE, MAX_TONE))
+        return _Shape(self.corners + step[:8].reshape(4, 2), float(np.clip(log_blur, -2.0, 3.5)), tone)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Picture:
+    """Residuals (n,) of a shape under the best light, their slopes (n, 10) by shape and (n, 7) by light."""
+
+    residual: Array
+    slope: Array
+    light: Array
+
+    @property
+    def design(self) -> Array:
+        return np.hstack([self.slope, self.light])
+
+    @property
+    def scale(self) -> float:
+        return max(1.4826 * float(np.median(np.abs(self.residual))), 0.3)
 
 
 def fit_pattern(grey: Image, camera: Camera, family: Family, tag_id: int, start: CornerFit) -> CornerFit | None:
-    """Fit corners, blur and light of a tag's known pattern to the image by least squares, from a start.
+    """Fit corners, blur, tone and light of a tag's known pattern to the image by least squares, from a start.
 
+    The tone is the exponent between light, which a lens blurs, and grey values: without it white would seem to grow.
     The covariance is that of the residuals: noise, and whatever the model of a Gaussian blur does not explain.
     Returns None where the pattern does not explain the image.
     """
     patch = _patch(grey, camera, family, start)
-    if len(patch.values) < 8 + 1 + N_LIGHT + 8:
+    if len(patch.values) < 2 * (N_SHAPE + N_LIGHT):
         return None
     cells = pattern(family.name, tag_id).astype(np.float64)
-    corners, log_blur, damping = start.flat.copy(), math.log(max(start.blur_px, 0.3)), 1e-4
+    shape, damping = _Shape(start.flat, math.log(max(start.blur_px, 0.3)), 1.0), 1e-4
     weights = np.ones(len(patch.values))
-    residual, slope, light = _model(patch, family, cells, corners, log_blur, weights)
-    scale = _scale(residual)
-    for _ in range(12):
-        weights = 1.0 / (1.0 + (residual / (4.0 * scale)) ** 4)
-        # Light enters linearly: of the slope, what light cannot explain
-        design = np.hstack([slope, light]) * np.sqrt(weights)[:, None]
-        normal = design.T @ design
-        gradient = design.T @ (residual * np.sqrt(weights))
+    picture = _picture(patch, family, cells, shape, weights)
+    for _ in range(15):
+        weights = 1.0 / (1.0 + (picture.residual / (4.0 * picture.scale)) ** 4)
+        design = picture.design
+        normal, gradient = design.T @ (design * weights[:, None]), design.T @ (weights * picture.residual)
         step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), gradient, rcond=None)[0]
-        moved, blur = corners + step[:8].reshape(4, 2), log_blur + float(np.clip(step[8], -0.5, 0.5))
-        if np.abs(step[:8]).max() > 10.0 or not -2.5 < blur < 3.5:
+        if np.abs(step[:8]).max() > 10.0:
             return None
-        new = _model(patch, family, cells, moved, blur, weights)
-        if float(weights @ new[0] ** 2) <= float(weights @ residual**2):
-            small = float(np.abs(step[:8]).max()) < 1e-3
-            corners, log_blur, (residual, slope, light), damping = moved, blur, new, max(damping / 10, 1e-9)
-            scale = _scale(residual)
-            if small:
+        moved = shape.moved(step)
+        new = _picture(patch, family, cells, moved, weights)
+        if float(weights @ new.residual**2) <= float(weights @ picture.residual**2):
+            shape, picture, damping = moved, new, max(damping / 10, 1e-9)
+            if float(np.abs(step[:8]).max()) < 1e-3:
                 break
         elif damping > 1e3:
             break
         else:
             damping *= 10
-    return _judged(patch, corners, log_blur, residual, slope, light, weights)
+    return _judged(patch, shape, picture, weights)
 
 
-def _judged(
-    patch: _Patch, corners: Array, log_blur: float, residual: Array, slope: Array, light: Array, weights: Array
-) -> CornerFit | None:
+def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weights: Array) -> CornerFit | None:
     contrast = float(np.ptp(np.quantile(patch.values, [0.05, 0.95])))
-    design = np.hstack([slope, light])
-    n, p = design.shape
-    variance = float(weights @ residual**2) / max(float(weights.sum()) - p, 1.0)
+    design = picture.design
+    freedom = max(float(weights.sum()) - design.shape[1], 1.0)
+    variance = float(weights @ picture.residual**2) / freedom
     if math.sqrt(variance) > MAX_MISFIT * contrast:
         return None
-    covariance = np.linalg.pinv(design.T @ (design * weights[:, None]))[:8, :8] * variance * _correlation(patch, residual)
+    variance *= _correlation(patch, picture.residual)
+    covariance = np.linalg.pinv(design.T @ (design * weights[:, None]), hermitian=True)[:8, :8] * variance
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         return None
-    return CornerFit(corners, covariance, math.exp(log_blur))
-
-
-def _scale(residual: Array) -> float:
-    return max(1.4826 * float(np.median(np.abs(residual))), 0.3)
+    return CornerFit(shape.corners, covariance, math.exp(shape.log_blur))
 
 
 def _correlation(patch: _Patch, residual: Array) -> float:
-    """Return by how much the variance of means exceeds that of independent residuals, from their neighbours' product."""
-    rows, columns = (w - w.min() for w in patch.where)
+    """Return by how much the variance of means exceeds that of independent residuals, from neighbours' products."""
+    rows, columns = patch.rows - patch.rows.min(), patch.columns - patch.columns.min()
     image = np.full((rows.max() + 1, columns.max() + 1), np.nan)
     image[rows, columns] = residual
     factor, square = 1.0, float(np.mean(residual**2))
@@ -111,87 +141,137 @@ def _correlation(patch: _Patch, residual: Array) -> float:
 
 def _patch(grey: Image, camera: Camera, family: Family, start: CornerFit) -> _Patch:
     corners = bend(camera, start.flat)
-    height, width = grey.shape
-    low = np.clip(np.floor(corners.min(axis=0)) - 2, 0, (width, height)).astype(int)
-    high = np.clip(np.ceil(corners.max(axis=0)) + 2, 0, (width, height)).astype(int)
-    area = float(np.prod(np.maximum(high - low, 1)))
-    stride = max(1, round(math.sqrt(area / MAX_PIXELS)))
-    rows, columns = np.meshgrid(
-        np.arange(low[1], high[1], stride), np.arange(low[0], high[0], stride), indexing="ij"
-    )
-    rows, columns = rows.ravel(), columns.ravel()
+    low = np.clip(np.floor(corners.min(axis=0)) - 2, 0, grey.shape[::-1]).astype(int)
+    high = np.clip(np.ceil(corners.max(axis=0)) + 2, 0, grey.shape[::-1]).astype(int)
+    rows, columns = (w.ravel() for w in np.mgrid[low[1] : high[1], low[0] : high[0]])
+    centre = start.flat.mean(axis=0)[None]
+    flat_by_pixel = np.linalg.inv(bend_slope(camera, centre)[0])
+    # Which of many pixels are near an edge need not be known exactly: without the lens's curvature
+    flat = centre + (np.column_stack([columns + 0.5, rows + 0.5]) - bend(camera, centre)) @ flat_by_pixel.T
+    near = _near(family, start, flat, flat_by_pixel)
+    rows, columns = rows[near], columns[near]
+    nodes = len(_Axes.of(_derivative(_tag_from_flat(start.flat, family.cells), centre) @ flat_by_pixel, 1.0).nodes)
+    every = max(1, math.ceil(len(rows) * nodes / MAX_SAMPLES))
+    # A lattice that is not aligned with the rows of pixels
+    kept = (rows * max(round(0.382 * every), 1) + columns) % every == 0
+    rows, columns = rows[kept], columns[kept]
     flat = flatten(camera, np.column_stack([columns + 0.5, rows + 0.5]))
-    places = _apply(_tag_from_flat(start.flat, family.cells), flat)
-    near = ((places > -OUTSIDE_CELLS) & (places < family.cells + OUTSIDE_CELLS)).all(axis=1)
-    slope = np.linalg.inv(bend_slope(camera, start.flat.mean(axis=0)[None])[0])
-    where = rows[near] // stride, columns[near] // stride
-    return _Patch(grey[rows[near], columns[near]].astype(np.float64), flat[near], slope, where)
+    return _Patch(grey[rows, columns].astype(np.float64), flat, flat_by_pixel, rows, columns)
 
 
-def _model(
-    patch: _Patch, family: Family, cells: Array, corners: Array, log_blur: float, weights: Array
-) -> tuple[Array, Array, Array]:
-    """Return residuals (n,), the slope (n, 9) of the picture by corners and blur, and that (n, 7) by light."""
-    tag_from_flat = _tag_from_flat(corners, family.cells)
+def _near(family: Family, start: CornerFit, flat: Array, flat_by_pixel: Array) -> NDArray[np.bool_]:
+    """Return bool[n]: which places lie on the square, or not far outside, and near the edge of a cell."""
+    tag_from_flat = _tag_from_flat(start.flat, family.cells)
+    places = _apply(tag_from_flat, flat)
+    slope = _derivative(tag_from_flat, flat) @ flat_by_pixel
+    off = np.abs(places - np.round(places)) / np.maximum(np.linalg.norm(slope, axis=2), 1e-12)
+    within = ((places > -OUTSIDE_CELLS) & (places < family.cells + OUTSIDE_CELLS)).all(axis=1)
+    near: NDArray[np.bool_] = within & (off.min(axis=1) < NEAR_BLURS * start.blur_px + NEAR_PX)
+    return near
+
+
+@dataclasses.dataclass(frozen=True)
+class _Axes:
+    """A Gaussian blur of the image, seen in cells at n places, as one along the tag's axes and one along a line.
+
+    In the tag's axes it has the covariance S = blur^2 A A' with A (n, 2, 2) = d(place)/d(pixel). Along the axes a
+    blurred pattern is a product of error functions; with deviations (n, 2) of sqrt((1 - |r|) diag S), r the
+    correlation, the rest of S has rank one: ``aslant`` (n, 2), over which ``nodes`` sum.
+    """
+
+    deviation: Array
+    axial: Array
+    aslant: Array
+    nodes: Array
+
+    @staticmethod
+    def of(by_pixel: Array, blur_px: float) -> _Axes:
+        spread = by_pixel @ by_pixel.transpose(0, 2, 1) * blur_px**2
+        deviation = np.sqrt(np.stack([spread[:, 0, 0], spread[:, 1, 1]], axis=1))
+        r = np.clip(spread[:, 0, 1] / (deviation[:, 0] * deviation[:, 1]), -0.999, 0.999)
+        aslant = deviation * np.sqrt(np.abs(r))[:, None] * np.column_stack([np.ones(len(r)), np.sign(r)])
+        return _Axes(deviation, deviation * np.sqrt(1.0 - np.abs(r))[:, None], aslant, _nodes(float(np.abs(r).max())))
+
+
+def _nodes(correlation: float) -> Array:
+    """Return the nodes of a sum over a Gaussian, as close as what it is convolved with is narrow."""
+    if correlation < 0.02:
+        return np.zeros(1)
+    spacing = math.sqrt((1.0 - correlation) / correlation)
+    half = min(max(math.ceil(NODE_REACH / spacing), 2), MAX_NODES // 2)
+    return np.linspace(-NODE_REACH, NODE_REACH, 2 * half + 1)
+
+
+def _picture(patch: _Patch, family: Family, cells: Array, shape: _Shape, weights: Array) -> _Picture:
+    tag_from_flat = _tag_from_flat(shape.corners, family.cells)
     places = _apply(tag_from_flat, patch.flat)
-    by_flat = _derivative(tag_from_flat, patch.flat)
-    blur = math.exp(log_blur)
-    ink, by_place = _blurred(family, cells, places, by_flat @ patch.flat_by_pixel, blur)
-    rest, _ = _blurred(family, np.ones((1, 1)), places, by_flat @ patch.flat_by_pixel, blur)
-    wider, _ = _blurred(family, cells, places, by_flat @ patch.flat_by_pixel, blur * 1.01)
+    axes = _Axes.of(_derivative(tag_from_flat, patch.flat) @ patch.flat_by_pixel, math.exp(shape.log_blur))
+    ink, by_place, by_blur = _blurred(family, cells, places, axes)
+    ink, by_ink, by_tone = _toned(ink, shape.tone)
     place = (places - family.cells / 2) / family.cells
     ramps = np.column_stack([np.ones(len(place)), place])
-    light = np.hstack([ramps, ramps * ink[:, None], 1.0 - rest[:, None]])
+    light = np.hstack([ramps, ramps * ink[:, None], 1.0 - _within(family, places, axes)[:, None]])
     root = np.sqrt(weights)
     amount = np.linalg.lstsq(light * root[:, None], patch.values * root, rcond=None)[0]
-    residual = patch.values - light @ amount
     white = ramps @ amount[3:6]
-    slope = np.empty((len(residual), 9))
+    slope = np.empty((len(place), N_SHAPE))
     for k in range(8):
         # A corner that moves carries the pattern along: places move against it
-        bumped = corners.copy()
+        bumped = shape.corners.copy()
         bumped[k // 2, k % 2] += 1e-3
         moved = (_apply(_tag_from_flat(bumped, family.cells), patch.flat) - places) / 1e-3
-        slope[:, k] = white * np.einsum("ni,ni->n", by_place, moved)
-    slope[:, 8] = white * (wider - ink) / 0.01
-    return residual, slope, light
+        slope[:, k] = white * by_ink * np.einsum("ni,ni->n", by_place, moved)
+    slope[:, 8] = white * by_ink * by_blur
+    slope[:, 9] = white * by_tone
+    return _Picture(patch.values - light @ amount, slope, light)
 
 
-def _blurred(family: Family, cells: Array, places: Array, by_pixel: Array, blur_px: float) -> tuple[Array, Array]:
-    """Return the pattern at places (n, 2) in cells, blurred by a Gaussian of the image, and its derivative (n, 2).
+def _toned(ink: Array, tone: float) -> tuple[Array, Array, Array]:
+    """Return grey values (n,) of 0..1 for reflected light of 0..1, and their derivatives by light and by tone."""
 
-    In the tag's axes the Gaussian has the covariance S = blur^2 A A', A (n, 2, 2) = d(place)/d(pixel). Along the axes
-    the blurred pattern is a product of error functions; the correlated rest of S has rank one and is summed over nodes.
-    """
-    spread = by_pixel @ by_pixel.transpose(0, 2, 1) * blur_px**2
-    deviation = np.sqrt(np.stack([spread[:, 0, 0], spread[:, 1, 1]], axis=1))
-    rho = np.clip(spread[:, 0, 1] / (deviation[:, 0] * deviation[:, 1]), -0.999, 0.999)
-    axial = deviation * np.sqrt(1.0 - np.abs(rho))[:, None]
-    aslant = deviation * np.sqrt(np.abs(rho))[:, None] * np.column_stack([np.ones(len(rho)), np.sign(rho)])
-    nodes, weights = (NODES, NODE_WEIGHTS) if np.abs(rho).max() > 0.02 else (np.zeros(1), np.ones(1))
-    value, slope = np.zeros(len(places)), np.zeros((len(places), 2))
-    margin = (len(cells) - family.cells) / 2 if len(cells) > 1 else (family.total - family.cells) / 2
-    bounds = np.arange(1, len(cells)) - margin if len(cells) > 1 else np.array([-margin, family.cells + margin])
-    for node, weight in zip(nodes, weights / weights.sum(), strict=True):
-        shifted = places + node * aslant
-        (gu, du), (gv, dv) = (_shares(bounds, shifted[:, i], axial[:, i]) for i in (0, 1))
-        if len(cells) == 1:
-            value += weight * gu[:, 1] * gv[:, 1]
-            continue
-        rows = gv @ cells
+    def curve(exponent: float) -> Array:
+        span = (1.0 + BLACK) ** exponent - BLACK**exponent
+        return ((ink + BLACK) ** exponent - BLACK**exponent) / span
+
+    by_ink = tone * (ink + BLACK) ** (tone - 1.0) / ((1.0 + BLACK) ** tone - BLACK**tone)
+    return curve(tone), by_ink, (curve(tone + 1e-4) - curve(tone - 1e-4)) / 2e-4
+
+
+def _blurred(family: Family, cells: Array, places: Array, axes: _Axes) -> tuple[Array, Array, Array]:
+    """Return the blurred pattern at places (n, 2) in cells, its derivative (n, 2) by place, and (n,) by log blur."""
+    bounds = np.arange(1, len(cells)) - (family.total - family.cells) / 2
+    value, slope, by_blur = np.zeros(len(places)), np.zeros((len(places), 2)), np.zeros(len(places))
+    weights = np.exp(-0.5 * axes.nodes**2)
+    for node, weight in zip(axes.nodes, weights / weights.sum(), strict=True):
+        shifted = places + node * axes.aslant
+        gu, gu_at, gu_blur = _shares(bounds, shifted[:, 0], axes.axial[:, 0])
+        gv, gv_at, gv_blur = _shares(bounds, shifted[:, 1], axes.axial[:, 1])
+        rows, by_row = gv @ cells, gv_at @ cells
+        u, v = np.einsum("nj,nj->n", rows, gu_at), np.einsum("nj,nj->n", by_row, gu)
         value += weight * np.einsum("nj,nj->n", rows, gu)
-        slope[:, 0] += weight * np.einsum("nj,nj->n", rows, du)
-        slope[:, 1] += weight * np.einsum("nj,nj->n", dv @ cells, gu)
-    return value, slope
+        slope += weight * np.column_stack([u, v])
+        by_blur += weight * (node * (u * axes.aslant[:, 0] + v * axes.aslant[:, 1]))
+        by_blur += weight * (np.einsum("nj,nj->n", rows, gu_blur) + np.einsum("nj,nj->n", gv_blur @ cells, gu))
+    return value, slope, by_blur
 
 
-def _shares(bounds: Array, at: Array, deviation: Array) -> tuple[Array, Array]:
-    """Return the share of a Gaussian at ``at`` in each of the intervals between bounds, and its derivative by ``at``."""
+def _shares(bounds: Array, at: Array, deviation: Array) -> tuple[Array, Array, Array]:
+    """Return a Gaussian's share of each interval between bounds, and its derivatives by place and log deviation."""
     z = (bounds - at[:, None]) / deviation[:, None]
-    below = np.hstack([np.zeros((len(at), 1)), ndtr(z), np.ones((len(at), 1))])
-    density = np.exp(-0.5 * z**2) / (math.sqrt(2 * math.pi) * deviation[:, None])
-    density = np.hstack([np.zeros((len(at), 1)), density, np.zeros((len(at), 1))])
-    return np.diff(below, axis=1), -np.diff(density, axis=1)
+    none = np.zeros((len(at), 1))
+    density = np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
+    share = np.diff(np.hstack([none, ndtr(z), none + 1.0]), axis=1)
+    by_place = -np.diff(np.hstack([none, density / deviation[:, None], none]), axis=1)
+    return share, by_place, -np.diff(np.hstack([none, z * density, none]), axis=1)
+
+
+def _within(family: Family, places: Array, axes: _Axes) -> Array:
+    """Return how much (n,) of the blurred neighbourhood of places lies within the printed pattern."""
+    margin = (family.total - family.cells) / 2
+    bounds = np.array([-margin, family.cells + margin])
+    (u, _, _), (v, _, _) = (_shares(bounds, places[:, i], axes.deviation[:, i]) for i in (0, 1))
+    result: Array = u[:, 1] * v[:, 1]
+    return result
 
 
 def _tag_from_flat(corners: Array, cells: int) -> Array:
