@@ -20,12 +20,12 @@ from fieldkit.types import Image
 
 Array = NDArray[np.float64]
 
-# What no edge shows: grey values are whole numbers, paper is not quite flat, nor a lens quite calibrated
+# What no residual shows: a blur that is no Gaussian, as measured on renders without a lens (docs/detection.md)
 UNSEEN_SIGMA_PX = 0.02
-# Corners as a detector leaves them, where neither edges nor pattern could be fitted: see docs/detection.md
-COARSE_SIGMA_PX = 0.5
-# Beyond this share of a cell, blur carries the neighbouring cells into an edge: the whole pattern is fitted
-EDGE_BLUR_CELLS = 0.12
+# What lines miss where the pattern cannot be fitted: a lens blurs light, so that white grows into black
+LINES_SIGMA_PX = 0.4
+# Corners as a detector leaves them, where neither pattern nor edges could be fitted
+COARSE_SIGMA_PX = 0.6
 # Blur from which a pattern's fit starts where no edge shows it
 SHARP_BLUR_PX = 0.7
 # How far a fit may move a detector's corners
@@ -62,8 +62,8 @@ def detect(
 ) -> list[TagDetection]:
     """Find tags in an image uint8[h, w] (grey) or uint8[h, w, 3] (RGB), sorted by id and position.
 
-    Corners come from lines fitted to the tag's edges or, where blur mixes its cells, from its whole pattern, in
-    undistorted coordinates; the photo itself is not resampled. Their covariance is what the fit's residuals show.
+    Corners come from the tag's whole pattern, fitted in undistorted coordinates; the photo itself is not resampled.
+    Their covariance is what the fit's residuals show.
     ``detector`` is one of `DETECTORS`; without it each family has its own. Raises TagError for an unknown family or
     detector, one that does not find the family, or an image of another size than the camera.
     """
@@ -80,7 +80,7 @@ def detect(
 
 
 def _refine(grey: Image, camera: Camera, family: Family, found: FoundTag) -> TagDetection:
-    """Fit the square's edges, and where its cells are blurred into each other its pattern; else keep the corners."""
+    """Fit the tag's pattern, from lines along its edges; else keep the lines' corners, else the detector's."""
     coarse = TagDetection(found.id, family.name, found.corners_px, COARSE_SIGMA_PX)
     limit = max(MAX_MOVE_PX, MAX_MOVE_CELLS * coarse.edge_px / family.cells)
     fit = fit_square(grey, camera, found.corners_px, family.cells, is_reversed=family.is_reversed)
@@ -88,21 +88,15 @@ def _refine(grey: Image, camera: Camera, family: Family, found: FoundTag) -> Tag
         fit = None
     start = fit or CornerFit(flatten(camera, found.corners_px), np.eye(8), SHARP_BLUR_PX)
     whole = fit_pattern(grey, camera, family, found.id, start)
+    unseen = LINES_SIGMA_PX
     if whole is not None and _moved(camera, whole, found) <= limit:
-        fit = whole
+        fit, unseen = whole, UNSEEN_SIGMA_PX
     if fit is None:
         return coarse
-    covariance = bent_covariance(camera, fit.flat, fit.covariance) + UNSEEN_SIGMA_PX**2 * np.eye(8)
+    covariance = bent_covariance(camera, fit.flat, fit.covariance) + unseen**2 * np.eye(8)
     sigma = float(np.sqrt(np.trace(covariance) / 8))
     return dataclasses.replace(coarse, corners_px=bend(camera, fit.flat), sigma_px=sigma, covariance_px=covariance)
 
 
 def _moved(camera: Camera, fit: CornerFit, found: FoundTag) -> float:
     return float(np.linalg.norm(bend(camera, fit.flat) - found.corners_px, axis=1).max())
-
-
-def cell_px(corners: Array, cells: int) -> float:
-    """Return the height of a cell across the longest edge of corners (4, 2): what foreshortening leaves of it."""
-    (ax, ay), (bx, by) = corners[2] - corners[0], corners[3] - corners[1]
-    longest = float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).max())
-    return max(float(abs(ax * by - ay * bx)) / 2 / longest / cells, 0.1)

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 # Both search an image of at most this edge length first; corners are refined at full size all the same
 SEARCH_EDGE_PX = 1600
-# pupil-apriltags: bits of the code that may be wrong, and what its decision must be clear by
-MAX_HAMMING, MIN_MARGIN = 1, 20.0
+# What pupil-apriltags' decision between black and white must be clear by
+MIN_MARGIN = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,12 +45,12 @@ class TagDetector:
 def _find_pupil(grey: Image, family: Family) -> list[FoundTag]:
     coarse = float(max(1, round(max(grey.shape) / SEARCH_EDGE_PX)))
     for decimate in dict.fromkeys((coarse, max(1.0, coarse / 2))):
-        found = _pupil(family.name, decimate).detect(grey)
+        found = _pupil(family, decimate).detect(grey)
         # Its corners are in our order, and the centre of its first pixel is (0.5, 0.5)
         tags = [
             FoundTag(int(r.tag_id), np.array(r.corners, dtype=np.float64))
             for r in found
-            if r.hamming <= MAX_HAMMING and r.decision_margin >= MIN_MARGIN
+            if r.decision_margin >= MIN_MARGIN
         ]
         if tags:
             return tags
@@ -58,15 +58,16 @@ def _find_pupil(grey: Image, family: Family) -> list[FoundTag]:
 
 
 @functools.lru_cache(maxsize=64)
-def _pupil(family: str, decimate: float) -> PupilDetector:
+def _pupil(family: Family, decimate: float) -> PupilDetector:
     # One family each: given several, pupil-apriltags silently uses only the first. Its own refinement of the edges
     # moves those of small tags so far that they are not decoded; ours comes after
-    return PupilDetector(family, wrong_bits=MAX_HAMMING, nthreads=1, quad_decimate=decimate, refine_edges=0)
+    return PupilDetector(family, nthreads=1, quad_decimate=decimate, refine_edges=0)
 
 
 def _find_opencv(grey: Image, family: Family) -> list[FoundTag]:
     assert family.opencv is not None
     settings = cv2.aruco.DetectorParameters()
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
     scale = min(1.0, SEARCH_EDGE_PX / max(grey.shape))
     small = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(family.opencv), settings)

@@ -23,7 +23,9 @@ class Family:
     """A tag family, in cells: the edge of the square whose corners count, and that of the whole pattern.
 
     The square is black on white; where ``is_reversed``, it is white on black and data lies outside of it as well.
-    ``opencv`` is OpenCV's dictionary, and ``in_pupil`` whether pupil-apriltags finds the family.
+    ``opencv`` is OpenCV's dictionary, and ``in_pupil`` whether pupil-apriltags finds the family. ``wrong_bits`` is how
+    many bits of a code may be read wrongly: as many as leave a random square a chance below one in 5000 to be a tag,
+    and AprilTag's table of codes below 200 MB.
     """
 
     name: str
@@ -32,19 +34,20 @@ class Family:
     is_reversed: bool = False
     opencv: int | None = None
     in_pupil: bool = True
+    wrong_bits: int = 2
 
 
 FAMILIES: dict[str, Family] = {
     f.name: f
     for f in (
         Family("tag36h11", 8, 10, opencv=cv2.aruco.DICT_APRILTAG_36h11),
-        Family("tag25h9", 7, 9, opencv=cv2.aruco.DICT_APRILTAG_25h9),
-        Family("tag16h5", 6, 8, opencv=cv2.aruco.DICT_APRILTAG_16h5),
-        Family("tagCircle21h7", 5, 9, is_reversed=True),
-        Family("tagCircle49h12", 5, 11, is_reversed=True),
-        Family("tagCustom48h12", 6, 10, is_reversed=True),
+        Family("tag25h9", 7, 9, opencv=cv2.aruco.DICT_APRILTAG_25h9, wrong_bits=1),
+        Family("tag16h5", 6, 8, opencv=cv2.aruco.DICT_APRILTAG_16h5, wrong_bits=0),
+        Family("tagCircle21h7", 5, 9, is_reversed=True, wrong_bits=0),
+        Family("tagCircle49h12", 5, 11, is_reversed=True, wrong_bits=1),
+        Family("tagCustom48h12", 6, 10, is_reversed=True, wrong_bits=1),
         Family("tagStandard41h12", 5, 9, is_reversed=True),
-        Family("tagStandard52h13", 6, 10, is_reversed=True),
+        Family("tagStandard52h13", 6, 10, is_reversed=True, wrong_bits=1),
         Family("tag36h10", 8, 10, opencv=cv2.aruco.DICT_APRILTAG_36h10, in_pupil=False),
     )
 }
@@ -64,12 +67,12 @@ class PupilDetector(_Undying):
     all codes with two wrong bits, which takes gigabytes in the large families.
     """
 
-    def __init__(self, family: str, *, wrong_bits: int = 1, **settings: object) -> None:
+    def __init__(self, family: Family, **settings: object) -> None:
         super().__init__(families="tag16h5", **settings)
-        known = family_struct(family)
+        known = family_struct(family.name)
         self.libc.apriltag_detector_clear_families(self.tag_detector_ptr)
-        self.libc.apriltag_detector_add_family_bits(self.tag_detector_ptr, known, wrong_bits)
-        self.tag_families = {family: known}
+        self.libc.apriltag_detector_add_family_bits(self.tag_detector_ptr, known, family.wrong_bits)
+        self.tag_families = {family.name: known}
         self.tag_detector_ptr.contents.decode_sharpening = float(self.params["decode_sharpening"])
 
 

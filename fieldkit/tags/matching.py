@@ -45,6 +45,7 @@ class _Patch:
     flat_by_pixel: Array
     rows: Ints
     columns: Ints
+    is_outline: NDArray[np.bool_]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +120,7 @@ def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weights: Array) -> 
     variance = float(weights @ picture.residual**2) / freedom
     if math.sqrt(variance) > MAX_MISFIT * contrast:
         return None
-    variance *= _correlation(patch, picture.residual)
+    variance *= _correlation(patch, picture.residual) * _bending(patch, picture, variance)
     covariance = np.linalg.pinv(design.T @ (design * weights[:, None]), hermitian=True)[:8, :8] * variance
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         return None
@@ -139,6 +140,19 @@ def _correlation(patch: _Patch, residual: Array) -> float:
     return factor
 
 
+def _bending(patch: _Patch, picture: _Picture, variance: float) -> float:
+    """Return by how much more than its noise the outline alone would move the corners: paper that is not flat.
+
+    The interior of a bent tag, or of one that something covers at its rim, fits another square than its outline.
+    """
+    slope, residual = picture.slope[patch.is_outline, :8], picture.residual[patch.is_outline]
+    if len(residual) <= 8:
+        return 1.0
+    gradient = slope.T @ residual
+    chi2 = float(gradient @ np.linalg.pinv(slope.T @ slope, hermitian=True) @ gradient) / variance
+    return max(1.0, chi2 / 8)
+
+
 def _patch(grey: Image, camera: Camera, family: Family, start: CornerFit) -> _Patch:
     corners = bend(camera, start.flat)
     low = np.clip(np.floor(corners.min(axis=0)) - 2, 0, grey.shape[::-1]).astype(int)
@@ -156,7 +170,9 @@ def _patch(grey: Image, camera: Camera, family: Family, start: CornerFit) -> _Pa
     kept = (rows * max(round(0.382 * every), 1) + columns) % every == 0
     rows, columns = rows[kept], columns[kept]
     flat = flatten(camera, np.column_stack([columns + 0.5, rows + 0.5]))
-    return _Patch(grey[rows, columns].astype(np.float64), flat, flat_by_pixel, rows, columns)
+    off = np.abs(_apply(_tag_from_flat(start.flat, family.cells), flat) - family.cells / 2).max(axis=1)
+    is_outline = off > (family.cells - 1) / 2
+    return _Patch(grey[rows, columns].astype(np.float64), flat, flat_by_pixel, rows, columns, is_outline)
 
 
 def _near(family: Family, start: CornerFit, flat: Array, flat_by_pixel: Array) -> NDArray[np.bool_]:
