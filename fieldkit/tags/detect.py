@@ -15,7 +15,7 @@ from fieldkit.tags.detectors import FoundTag, find_detector
 from fieldkit.tags.edges import CornerFit, fit_square
 from fieldkit.tags.families import Family, find_family
 from fieldkit.tags.lens import bend, bent_covariance, flatten
-from fieldkit.tags.matching import fit_pattern
+from fieldkit.tags.matching import fit_pattern, misplacement_px
 from fieldkit.types import Image
 
 Array = NDArray[np.float64]
@@ -24,12 +24,12 @@ Array = NDArray[np.float64]
 UNSEEN_SIGMA_PX = 0.02
 # What lines miss where the pattern cannot be fitted: a lens blurs light, so that white grows into black
 LINES_SIGMA_PX = 0.4
-# Corners as a detector leaves them, where neither pattern nor edges could be fitted
+# The least for corners as a detector leaves them, where neither pattern nor edges could be fitted
 COARSE_SIGMA_PX = 0.6
 # Blur from which a pattern's fit starts where no edge shows it
 SHARP_BLUR_PX = 0.7
 # How far a fit may move a detector's corners
-MAX_MOVE_PX, MAX_MOVE_CELLS = 2.0, 0.5
+MAX_MOVE_PX, MAX_MOVE_CELLS = 2.0, 0.7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,8 +63,7 @@ def detect(
     """Find tags in an image uint8[h, w] (grey) or uint8[h, w, 3] (RGB), sorted by id and position.
 
     Corners come from the tag's whole pattern, fitted in undistorted coordinates; the photo itself is not resampled.
-    Their covariance is what the fit's residuals show.
-    ``detector`` is one of `DETECTORS`; without it each family has its own. Raises TagError for an unknown family or
+    Their covariance is what the fit's residuals show. ``detector`` is one of `DETECTORS`; without it each family has its own. Raises TagError for an unknown family or
     detector, one that does not find the family, or an image of another size than the camera.
     """
     chosen = [(find_family(family), find_detector(family, detector)) for family in dict.fromkeys(families)]
@@ -82,7 +81,8 @@ def detect(
 def _refine(grey: Image, camera: Camera, family: Family, found: FoundTag) -> TagDetection:
     """Fit the tag's pattern, from lines along its edges; else keep the lines' corners, else the detector's."""
     coarse = TagDetection(found.id, family.name, found.corners_px, COARSE_SIGMA_PX)
-    limit = max(MAX_MOVE_PX, MAX_MOVE_CELLS * coarse.edge_px / family.cells)
+    cell_px = coarse.edge_px / family.cells
+    limit = max(MAX_MOVE_PX, MAX_MOVE_CELLS * cell_px)
     fit = fit_square(grey, camera, found.corners_px, family.cells, is_reversed=family.is_reversed)
     if fit is not None and _moved(camera, fit, found) > limit:
         fit = None
@@ -92,7 +92,11 @@ def _refine(grey: Image, camera: Camera, family: Family, found: FoundTag) -> Tag
     if whole is not None and _moved(camera, whole, found) <= limit:
         fit, unseen = whole, UNSEEN_SIGMA_PX
     if fit is None:
-        return coarse
+        off = misplacement_px(grey, camera, family, found.id, start)
+        # At the image's border the quad may end where the image does, though the tag goes on
+        edge = np.minimum(found.corners_px, np.array(grey.shape[::-1]) - found.corners_px).min()
+        cut = cell_px if edge < cell_px else 0.0
+        return dataclasses.replace(coarse, sigma_px=max(COARSE_SIGMA_PX, off, cut))
     covariance = bent_covariance(camera, fit.flat, fit.covariance) + unseen**2 * np.eye(8)
     sigma = float(np.sqrt(np.trace(covariance) / 8))
     return dataclasses.replace(coarse, corners_px=bend(camera, fit.flat), sigma_px=sigma, covariance_px=covariance)

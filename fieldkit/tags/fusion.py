@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
 from fieldkit.frames import Pose, compose_covariance, exp
 from fieldkit.tags.detect import TagDetection
+from fieldkit.tags.lens import flat_covariance, flatten
 from fieldkit.tags.pose import TagSolution, project_derivative, solve, tag_corners, tilt_is_known
 
 Array = NDArray[np.float64]
@@ -21,6 +24,10 @@ Mask = NDArray[np.bool_]
 GATE = 40.0
 # Difference of two solutions' chi-square below which neither is certain: odds of e^10
 CERTAIN = 20.0
+# Sightings from directions that span less share what their corners are wrong by (lens, paper, light): they count as one
+SPAN_RAD = math.radians(15.0)
+# A candidate that is turned by less than this (rad) is no other solution
+SAME_RAD = 0.03
 # What the stated noise of the cameras may be multiplied by
 SCALES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
@@ -43,8 +50,10 @@ class TagFix:
     ``used``, ``sigmas`` and ``ambiguities`` have one entry per sighting: whether it entered, its deviation from the
     result in standard deviations per degree of freedom, and its own ambiguity. ``flipped`` marks sightings whose own
     better solution is not the one that all together chose. ``scale`` multiplies the stated standard deviations of the
-    camera poses: their noise as the sightings show it. ``alternative`` is the other solution, when there is one,
-    ``ambiguity`` the ratio of the two residuals, and ``evidence`` the difference of their chi-squares.
+    camera poses: their noise as the sightings show it. ``span_rad`` is the largest angle between the directions from
+    which the tag is seen. ``alternative`` is the other solution, when there is one, ``ambiguity`` the ratio of the two
+    residuals, and ``evidence`` the difference of their chi-squares, of all sightings together where they span 15 deg, else
+    of the average one: from one direction, more sightings repeat the same error of a lens or of bent paper.
     """
 
     ref_from_tag: Pose
@@ -55,6 +64,7 @@ class TagFix:
     ambiguities: tuple[float, ...]
     flipped: tuple[bool, ...]
     scale: float
+    span_rad: float = 0.0
     alternative: Pose | None = None
     alternative_covariance: Array | None = None
     ambiguity: float = 0.0
@@ -117,18 +127,19 @@ def _fuse(
         tuple(s.ambiguity for s in solutions),
         tuple(_is_flipped(s, o, best) for s, o in zip(sightings, solutions, strict=True)),
         scale,
+        _span(problem.directions(best)[used]),
     )
     return _with_alternative(fix, problem, votes.others, used, factor)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    """Corners of n sightings as arrays: undistorted xy (n, 4, 2), focal, noise, cam_from_ref and its covariance."""
+    """Corners of n sightings as arrays: undistorted pixels (n, 4, 2), focal, their covariance, cam_from_ref and its."""
 
     points: Array
-    xy: Array
+    flat: Array
     focal: Array
-    sigma: Array
+    noise: Array
     rotation: Array
     translation: Array
     covariance: Array
@@ -138,9 +149,9 @@ class _Problem:
         cam_from_ref = [s.ref_from_cam.inv() for s in sightings]
         return _Problem(
             points,
-            np.stack([s.camera.unproject(s.detection.corners_px)[:, :2] for s in sightings]),
+            np.stack([flatten(s.camera, s.detection.corners_px) for s in sightings]),
             np.array([s.camera.focal_px for s in sightings]),
-            np.array([s.detection.sigma_px for s in sightings]),
+            np.stack([flat_covariance(s.camera, s.detection.corners_px, s.detection.noise_px) for s in sightings]),
             np.stack([p.rotation.as_matrix() for p in cam_from_ref]),
             np.stack([p.translation for p in cam_from_ref]),
             np.stack([s.covariance for s in sightings]),
@@ -148,7 +159,7 @@ class _Problem:
 
     def linearise(self, ref_from_tag: Pose) -> tuple[Array, Array, Array]:
         """Return residuals (n, 8) in pixels, their derivative by the tag (n, 8, 6) and by the cameras (n, 8, 6)."""
-        n = len(self.xy)
+        n = len(self.flat)
         rotation = ref_from_tag.rotation.as_matrix()
         x_in_ref = self.points @ rotation.T + ref_from_tag.translation
         x_in_cam = np.einsum("nij,kj->nki", self.rotation, x_in_ref) + self.translation[:, None]
@@ -166,13 +177,19 @@ class _Problem:
                 for x, z, f in zip(x_in_cam, in_front, self.focal, strict=True)
             ]
         )
-        residual = (self.xy * self.focal[:, None] - predicted).reshape(n, 8)
+        residual = (self.flat - predicted).reshape(n, 8)
         return residual, (slope @ by_tag).reshape(n, 8, 6), (slope @ by_cam).reshape(n, 8, 6)
+
+    def directions(self, ref_from_tag: Pose) -> Array:
+        """Return unit vectors (n, 3) in the tag frame from the tag to the cameras."""
+        cameras = -np.einsum("nji,nj->ni", self.rotation, self.translation)
+        rays = ref_from_tag.inv().apply(cameras)
+        result: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return result
 
     def weights(self, by_cam: Array, scale: float) -> tuple[Array, Array]:
         """Return the inverse covariance (n, 8, 8) of each sighting's residuals and its log determinant (n,)."""
-        noise = self.sigma[:, None, None] ** 2 * np.eye(8)
-        total = noise + scale**2 * by_cam @ self.covariance @ by_cam.transpose(0, 2, 1)
+        total = self.noise + scale**2 * by_cam @ self.covariance @ by_cam.transpose(0, 2, 1)
         return np.asarray(np.linalg.inv(total)), np.asarray(np.linalg.slogdet(total)[1])
 
     def chi2(self, ref_from_tag: Pose, scale: float) -> Array:
@@ -196,10 +213,11 @@ class _Problem:
     def rms_px(self, ref_from_tag: Pose, used: Mask, scale: float) -> float:
         """Return the root mean square per coordinate of what remains in the corners, in pixels.
 
-        The cameras have moved within their noise to fit: of a residual r with covariance S, sigma^2 S^-1 r remains.
+        The cameras have moved within their noise to fit: of a residual r with covariance S, N S^-1 r remains, with the
+        corners' own covariance N.
         """
         residual, _, by_cam = self.linearise(ref_from_tag)
-        remains = self.sigma[:, None] ** 2 * np.einsum("nab,nb->na", self.weights(by_cam, scale)[0], residual)
+        remains = np.einsum("nab,nbc,nc->na", self.noise, self.weights(by_cam, scale)[0], residual)
         return float(np.sqrt(np.mean(remains[used] ** 2)))
 
     def minimise(self, start: Pose, used: Mask, scale: float) -> Pose:
@@ -301,25 +319,45 @@ def _settle(
 
 
 def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], used: Mask, factor: float) -> TagFix:
-    """Look for the other solution among the remaining candidates: another minimum of the same problem."""
+    """Look for the other solution, another minimum of the same problem: from the mirror image, then from candidates."""
     best = float(problem.chi2(fix.ref_from_tag, fix.scale)[used].sum())
-    for start in [p for p in others if (fix.ref_from_tag.inv() * p).rotation.magnitude() > 0.03][:4]:
-        other = problem.minimise(start, used, fix.scale)
-        if (fix.ref_from_tag.inv() * other).rotation.magnitude() < 0.02:
-            continue
-        cost = float(problem.chi2(other, fix.scale)[used].sum())
+    mirrored = _mirrored(fix.ref_from_tag, problem.directions(fix.ref_from_tag)[used].mean(axis=0))
+    starts = [p for p in (mirrored, *others) if _turned(fix.ref_from_tag, p) > SAME_RAD]
+    minima = (problem.minimise(start, used, fix.scale) for start in starts[:8])
+    found = [(float(problem.chi2(p, fix.scale)[used].sum()), p) for p in minima if _turned(fix.ref_from_tag, p) > 0.02]
+    for cost, other in sorted(found, key=lambda f: f[0]):
         try:
             covariance = _covariance(problem.information(other, used, fix.scale)) * factor
         except np.linalg.LinAlgError:
             continue
+        repeated = 1 if fix.span_rad >= SPAN_RAD else int(used.sum())
         return dataclasses.replace(
             fix,
             alternative=other,
             alternative_covariance=covariance,
             ambiguity=float(np.sqrt(min(best, cost) / max(best, cost, 1e-12))),
-            evidence=(cost - best) / factor,
+            evidence=(cost - best) / factor / repeated,
         )
     return fix
+
+
+def _turned(one: Pose, two: Pose) -> float:
+    return float((one.inv() * two).rotation.magnitude())
+
+
+def _mirrored(ref_from_tag: Pose, tag_to_camera: Array) -> Pose:
+    """Return the pose whose picture from a direction (3,) in the tag frame, without perspective, is the same.
+
+    Mirrored at the plane that faces the camera, and at its own: the sign of its slant cannot be told.
+    """
+    d = tag_to_camera / np.linalg.norm(tag_to_camera)
+    turn = (np.eye(3) - 2 * np.outer(d, d)) @ np.diag([1.0, 1.0, -1.0])
+    return Pose.from_components(ref_from_tag.translation, ref_from_tag.rotation * Rotation.from_matrix(turn))
+
+
+def _span(directions: Array) -> float:
+    """Return the largest angle in rad between unit vectors (n, 3)."""
+    return float(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0)))
 
 
 def _covariance(information: Array) -> Array:

@@ -21,7 +21,7 @@ Ints = NDArray[np.int64]
 # What lies farther outside of the square than this share of a cell is not compared: the margin may end there
 OUTSIDE_CELLS = 0.5
 # Pixels times nodes of the blur that are computed: of a large tag every second or third pixel is compared
-MAX_SAMPLES = 40000
+MAX_SAMPLES = 12000
 # Most nodes for the part of the blur that is not along the tag's axes, and how far they reach in its deviations
 MAX_NODES, NODE_REACH = 31, 3.5
 # Only pixels that are nearer to an edge of a cell than so many deviations of the blur tell where it is
@@ -32,6 +32,8 @@ N_LIGHT = 7
 N_SHAPE = 10
 # Reflectance of black over that of white; tones between 1 (blur acts on grey values) and 0.45 (on light, as in a lens)
 BLACK, MIN_TONE, MAX_TONE = 0.05, 0.2, 2.0
+# Corners that move farther than the pixels near an edge start again from where they are, so many times
+MAX_ROUNDS = 3
 # A residual of more than this share of the contrast is no picture of this tag
 MAX_MISFIT = 0.2
 
@@ -86,7 +88,26 @@ def fit_pattern(grey: Image, camera: Camera, family: Family, tag_id: int, start:
     The covariance is that of the residuals: noise, and whatever the model of a Gaussian blur does not explain.
     Returns None where the pattern does not explain the image.
     """
+    for _ in range(MAX_ROUNDS):
+        fit = _fit_once(_patch(grey, camera, family, start), family, tag_id, start)
+        if fit is None or float(np.abs(fit.flat - start.flat).max()) < NEAR_PX:
+            return fit
+        start = fit
+    return None
+
+
+def misplacement_px(grey: Image, camera: Camera, family: Family, tag_id: int, start: CornerFit) -> float:
+    """Return by how many pixels, as a root mean square, the image says that corners are off, to first order."""
     patch = _patch(grey, camera, family, start)
+    if len(patch.values) < 2 * (N_SHAPE + N_LIGHT):
+        return 0.0
+    shape, cells = _Shape(start.flat, math.log(max(start.blur_px, 0.3)), 1.0), pattern(family.name, tag_id)
+    picture = _picture(patch, family, cells.astype(np.float64), shape, np.ones(len(patch.values)))
+    step = np.linalg.lstsq(picture.design, picture.residual, rcond=None)[0][:8]
+    return float(np.sqrt(np.mean(step**2)))
+
+
+def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> CornerFit | None:
     if len(patch.values) < 2 * (N_SHAPE + N_LIGHT):
         return None
     cells = pattern(family.name, tag_id).astype(np.float64)

@@ -55,7 +55,7 @@ class _Page:
 def write_sheets(path: Path, ids: Sequence[int], *, size_m: float, family: str, paper: str) -> None:
     """Write a PDF with one tag per page, at true scale; ``size_m`` is the edge length of the black square.
 
-    Raises TagError for an unknown family or paper, an id that the family does not have or that is given twice, a
+    Raises TagError for a family without a closed black square, an unknown paper, an id that the family does not have or that is given twice, a
     size that is no length, and a tag that does not fit the paper with its quiet margin, ruler and text.
     """
     if paper not in PAPERS:
@@ -65,6 +65,8 @@ def write_sheets(path: Path, ids: Sequence[int], *, size_m: float, family: str, 
     twice = [str(i) for i, n in Counter(ids).items() if n > 1]
     if twice:
         raise TagError(f"tag {', '.join(twice)} is given twice; expected every id once", hint="correct --ids")
+    if family not in DRAWN_FAMILIES:
+        raise TagError(f"cannot draw tag family {family!r} on a sheet", hint=suggestion(family, list(DRAWN_FAMILIES)))
     drawn = [draw_tag(family, tag_id, cell_px=1, border_cells=0) == 0 for tag_id in ids]
     page = _layout(size_m, family=family, paper=paper)
     buffer = io.BytesIO()
