@@ -12,6 +12,7 @@ from scipy.special import ndtr
 from fieldkit.cameras import Camera
 from fieldkit.tags.edges import CornerFit
 from fieldkit.tags.families import Family, pattern
+from fieldkit.tags.kernels import blurred_pattern
 from fieldkit.tags.lens import bend, bend_slope, flatten
 from fieldkit.types import Image
 
@@ -21,7 +22,7 @@ Ints = NDArray[np.int64]
 # What lies farther outside of the square than this share of a cell is not compared: the margin may end there
 OUTSIDE_CELLS = 0.5
 # Pixels times nodes of the blur that are computed: of a large tag every second or third pixel is compared
-MAX_SAMPLES = 12000
+MAX_SAMPLES = 200000
 # Most nodes for the part of the blur that is not along the tag's axes, and how far they reach in its deviations
 MAX_NODES, NODE_REACH = 31, 3.5
 # Only pixels that are nearer to an edge of a cell than so many deviations of the blur tell where it is
@@ -34,6 +35,8 @@ N_SHAPE = 10
 BLACK, MIN_TONE, MAX_TONE = 0.05, 0.2, 2.0
 # Corners that move farther than the pixels near an edge start again from where they are, so many times
 MAX_ROUNDS = 3
+# Residuals beyond this share of the contrast weigh less and less: glare, dirt; but not what the blur's shape leaves
+OUTLIER = 0.25
 # A residual of more than this share of the contrast is no picture of this tag
 MAX_MISFIT = 0.2
 
@@ -114,8 +117,9 @@ def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> C
     shape, damping = _Shape(start.flat, math.log(max(start.blur_px, 0.3)), 1.0), 1e-4
     weights = np.ones(len(patch.values))
     picture = _picture(patch, family, cells, shape, weights)
+    tolerated = max(4.0 * picture.scale, OUTLIER * _contrast(patch))
     for _ in range(15):
-        weights = 1.0 / (1.0 + (picture.residual / (4.0 * picture.scale)) ** 4)
+        weights = 1.0 / (1.0 + (picture.residual / tolerated) ** 4)
         design = picture.design
         normal, gradient = design.T @ (design * weights[:, None]), design.T @ (weights * picture.residual)
         step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), gradient, rcond=None)[0]
@@ -125,6 +129,7 @@ def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> C
         new = _picture(patch, family, cells, moved, weights)
         if float(weights @ new.residual**2) <= float(weights @ picture.residual**2):
             shape, picture, damping = moved, new, max(damping / 10, 1e-9)
+            tolerated = max(4.0 * picture.scale, OUTLIER * _contrast(patch))
             if float(np.abs(step[:8]).max()) < 1e-3:
                 break
         elif damping > 1e3:
@@ -135,17 +140,20 @@ def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> C
 
 
 def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weights: Array) -> CornerFit | None:
-    contrast = float(np.ptp(np.quantile(patch.values, [0.05, 0.95])))
     design = picture.design
     freedom = max(float(weights.sum()) - design.shape[1], 1.0)
     variance = float(weights @ picture.residual**2) / freedom
-    if math.sqrt(variance) > MAX_MISFIT * contrast:
+    if math.sqrt(variance) > MAX_MISFIT * _contrast(patch):
         return None
     variance *= _correlation(patch, picture.residual) * _bending(patch, picture, variance)
     covariance = np.linalg.pinv(design.T @ (design * weights[:, None]), hermitian=True)[:8, :8] * variance
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         return None
     return CornerFit(shape.corners, covariance, math.exp(shape.log_blur))
+
+
+def _contrast(patch: _Patch) -> float:
+    return float(np.ptp(np.quantile(patch.values, [0.05, 0.95])))
 
 
 def _correlation(patch: _Patch, residual: Array) -> float:
@@ -243,7 +251,11 @@ def _picture(patch: _Patch, family: Family, cells: Array, shape: _Shape, weights
     tag_from_flat = _tag_from_flat(shape.corners, family.cells)
     places = _apply(tag_from_flat, patch.flat)
     axes = _Axes.of(_derivative(tag_from_flat, patch.flat) @ patch.flat_by_pixel, math.exp(shape.log_blur))
-    ink, by_place, by_blur = _blurred(family, cells, places, axes)
+    margin = (family.total - family.cells) / 2
+    node_weights = np.exp(-0.5 * axes.nodes**2)
+    ink, by_place, by_blur = blurred_pattern(
+        cells, places + margin, axes.axial, axes.aslant, axes.nodes, node_weights / node_weights.sum()
+    )
     ink, by_ink, by_tone = _toned(ink, shape.tone)
     place = (places - family.cells / 2) / family.cells
     ramps = np.column_stack([np.ones(len(place)), place])
@@ -274,40 +286,11 @@ def _toned(ink: Array, tone: float) -> tuple[Array, Array, Array]:
     return curve(tone), by_ink, (curve(tone + 1e-4) - curve(tone - 1e-4)) / 2e-4
 
 
-def _blurred(family: Family, cells: Array, places: Array, axes: _Axes) -> tuple[Array, Array, Array]:
-    """Return the blurred pattern at places (n, 2) in cells, its derivative (n, 2) by place, and (n,) by log blur."""
-    bounds = np.arange(1, len(cells)) - (family.total - family.cells) / 2
-    value, slope, by_blur = np.zeros(len(places)), np.zeros((len(places), 2)), np.zeros(len(places))
-    weights = np.exp(-0.5 * axes.nodes**2)
-    for node, weight in zip(axes.nodes, weights / weights.sum(), strict=True):
-        shifted = places + node * axes.aslant
-        gu, gu_at, gu_blur = _shares(bounds, shifted[:, 0], axes.axial[:, 0])
-        gv, gv_at, gv_blur = _shares(bounds, shifted[:, 1], axes.axial[:, 1])
-        rows, by_row = gv @ cells, gv_at @ cells
-        u, v = np.einsum("nj,nj->n", rows, gu_at), np.einsum("nj,nj->n", by_row, gu)
-        value += weight * np.einsum("nj,nj->n", rows, gu)
-        slope += weight * np.column_stack([u, v])
-        by_blur += weight * (node * (u * axes.aslant[:, 0] + v * axes.aslant[:, 1]))
-        by_blur += weight * (np.einsum("nj,nj->n", rows, gu_blur) + np.einsum("nj,nj->n", gv_blur @ cells, gu))
-    return value, slope, by_blur
-
-
-def _shares(bounds: Array, at: Array, deviation: Array) -> tuple[Array, Array, Array]:
-    """Return a Gaussian's share of each interval between bounds, and its derivatives by place and log deviation."""
-    z = (bounds - at[:, None]) / deviation[:, None]
-    none = np.zeros((len(at), 1))
-    density = np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
-    share = np.diff(np.hstack([none, ndtr(z), none + 1.0]), axis=1)
-    by_place = -np.diff(np.hstack([none, density / deviation[:, None], none]), axis=1)
-    return share, by_place, -np.diff(np.hstack([none, z * density, none]), axis=1)
-
-
 def _within(family: Family, places: Array, axes: _Axes) -> Array:
     """Return how much (n,) of the blurred neighbourhood of places lies within the printed pattern."""
     margin = (family.total - family.cells) / 2
-    bounds = np.array([-margin, family.cells + margin])
-    (u, _, _), (v, _, _) = (_shares(bounds, places[:, i], axes.deviation[:, i]) for i in (0, 1))
-    result: Array = u[:, 1] * v[:, 1]
+    above, below = ((b - places) / axes.deviation for b in (family.cells + margin, -margin))
+    result: Array = (ndtr(above) - ndtr(below)).prod(axis=1)
     return result
 
 
