@@ -27,6 +27,8 @@ MAX_SAMPLES = 200000
 MAX_NODES, NODE_REACH = 31, 3.5
 # Only pixels that are nearer to an edge of a cell than so many deviations of the blur tell where it is
 NEAR_BLURS, NEAR_PX = 3.0, 1.5
+# Deviation of a pixel's own width
+PIXEL_PX = math.sqrt(1.0 / 12.0)
 # Light that changes across the tag: constant and two slopes for black, the same for white, and what lies beyond it
 N_LIGHT = 7
 # Corners, blur and tone
@@ -104,7 +106,7 @@ def misplacement_px(grey: Image, camera: Camera, family: Family, tag_id: int, st
     patch = _patch(grey, camera, family, start)
     if len(patch.values) < 2 * (N_SHAPE + N_LIGHT):
         return 0.0
-    shape, cells = _Shape(start.flat, math.log(max(start.blur_px, 0.3)), 1.0), pattern(family.name, tag_id)
+    shape, cells = _Shape(start.flat, math.log(_lens_blur(start.blur_px)), 1.0), pattern(family.name, tag_id)
     picture = _picture(patch, family, cells.astype(np.float64), shape, np.ones(len(patch.values)))
     step = np.linalg.lstsq(picture.design, picture.residual, rcond=None)[0][:8]
     return float(np.sqrt(np.mean(step**2)))
@@ -114,7 +116,7 @@ def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> C
     if len(patch.values) < 2 * (N_SHAPE + N_LIGHT):
         return None
     cells = pattern(family.name, tag_id).astype(np.float64)
-    shape, damping = _Shape(start.flat, math.log(max(start.blur_px, 0.3)), 1.0), 1e-4
+    shape, damping = _Shape(start.flat, math.log(_lens_blur(start.blur_px)), 1.0), 1e-4
     weights = np.ones(len(patch.values))
     picture = _picture(patch, family, cells, shape, weights)
     tolerated = max(4.0 * picture.scale, OUTLIER * _contrast(patch))
@@ -149,7 +151,12 @@ def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weights: Array) -> 
     covariance = np.linalg.pinv(design.T @ (design * weights[:, None]), hermitian=True)[:8, :8] * variance
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         return None
-    return CornerFit(shape.corners, covariance, math.exp(shape.log_blur))
+    return CornerFit(shape.corners, covariance, math.hypot(math.exp(shape.log_blur), PIXEL_PX))
+
+
+def _lens_blur(blur_px: float) -> float:
+    """Return what is left of a blur, as a deviation in pixels, without the pixel's own."""
+    return math.sqrt(max(blur_px**2 - PIXEL_PX**2, 0.2**2))
 
 
 def _contrast(patch: _Patch) -> float:
@@ -217,25 +224,34 @@ def _near(family: Family, start: CornerFit, flat: Array, flat_by_pixel: Array) -
 
 @dataclasses.dataclass(frozen=True)
 class _Axes:
-    """A Gaussian blur of the image, seen in cells at n places, as one along the tag's axes and one along a line.
+    """What blurs n places, seen in cells: the lens's Gaussian of the image, and the pixel that averages over its square.
 
-    In the tag's axes it has the covariance S = blur^2 A A' with A (n, 2, 2) = d(place)/d(pixel). Along the axes a
-    blurred pattern is a product of error functions; with deviations (n, 2) of sqrt((1 - |r|) diag S), r the
-    correlation, the rest of S has rank one: ``aslant`` (n, 2), over which ``nodes`` sum.
+    With A (n, 2, 2) = d(place)/d(pixel), the Gaussian has the covariance S = blur^2 A A' in the tag's axes. With its
+    correlation r, (1 - |r|) diag S acts along the axes, where a blurred pattern is a product of error functions; the
+    rest of S has rank one: ``aslant`` (n, 2), over which ``nodes`` sum. Along each axis the pixel is a box (``widths``)
+    and a narrower box, which counts as a Gaussian. ``axial`` (n, 2) are the deviations of all Gaussians along the
+    axes, ``lens`` (n, 2) the lens's share of their squares, ``deviation`` (n, 2) that of everything.
     """
 
     deviation: Array
     axial: Array
+    lens: Array
+    widths: Array
     aslant: Array
     nodes: Array
 
     @staticmethod
     def of(by_pixel: Array, blur_px: float) -> _Axes:
         spread = by_pixel @ by_pixel.transpose(0, 2, 1) * blur_px**2
-        deviation = np.sqrt(np.stack([spread[:, 0, 0], spread[:, 1, 1]], axis=1))
-        r = np.clip(spread[:, 0, 1] / (deviation[:, 0] * deviation[:, 1]), -0.999, 0.999)
-        aslant = deviation * np.sqrt(np.abs(r))[:, None] * np.column_stack([np.ones(len(r)), np.sign(r)])
-        return _Axes(deviation, deviation * np.sqrt(1.0 - np.abs(r))[:, None], aslant, _nodes(float(np.abs(r).max())))
+        variance = np.stack([spread[:, 0, 0], spread[:, 1, 1]], axis=1)
+        r = np.clip(spread[:, 0, 1] / np.sqrt(variance.prod(axis=1)), -0.999, 0.999)
+        sides = np.abs(by_pixel)
+        wide, narrow = sides.max(axis=2), sides.min(axis=2) ** 2 / 12
+        axial = variance * (1.0 - np.abs(r))[:, None] + narrow
+        aslant = np.sqrt(variance * np.abs(r)[:, None]) * np.column_stack([np.ones(len(r)), np.sign(r)])
+        lens = 1.0 - narrow / axial
+        deviation = np.sqrt(variance + narrow + wide**2 / 12)
+        return _Axes(deviation, np.sqrt(axial), lens, wide, aslant, _nodes(float(np.abs(r).max())))
 
 
 def _nodes(correlation: float) -> Array:
@@ -254,7 +270,14 @@ def _picture(patch: _Patch, family: Family, cells: Array, shape: _Shape, weights
     margin = (family.total - family.cells) / 2
     node_weights = np.exp(-0.5 * axes.nodes**2)
     ink, by_place, by_blur = blurred_pattern(
-        cells, places + margin, axes.axial, axes.aslant, axes.nodes, node_weights / node_weights.sum()
+        cells,
+        places + margin,
+        axes.axial,
+        axes.lens,
+        axes.widths,
+        axes.aslant,
+        axes.nodes,
+        node_weights / node_weights.sum(),
     )
     ink, by_ink, by_tone = _toned(ink, shape.tone)
     place = (places - family.cells / 2) / family.cells
