@@ -142,13 +142,15 @@ def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> C
 
 
 def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weights: Array) -> CornerFit | None:
-    design = picture.design
-    freedom = max(float(weights.sum()) - design.shape[1], 1.0)
-    variance = float(weights @ picture.residual**2) / freedom
-    if math.sqrt(variance) > MAX_MISFIT * _contrast(patch):
+    design, count = picture.design, float(weights.sum())
+    freedom = count / max(count - design.shape[1], 1.0)
+    if math.sqrt(freedom * float(weights @ picture.residual**2) / count) > MAX_MISFIT * _contrast(patch):
         return None
-    variance *= _correlation(patch, picture.residual) * _bending(patch, picture, variance)
-    covariance = np.linalg.pinv(design.T @ (design * weights[:, None]), hermitian=True)[:8, :8] * variance
+    # Residuals differ from pixel to pixel: at edges more than elsewhere (White 1980)
+    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]), hermitian=True)[:8]
+    scores = design * (weights * picture.residual)[:, None]
+    factor = freedom * _correlation(patch, picture.residual)
+    covariance = inverse @ (scores.T @ scores) @ inverse.T * factor + _bending_px(patch, picture) ** 2 * np.eye(8)
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         return None
     return CornerFit(shape.corners, covariance, math.hypot(math.exp(shape.log_blur), PIXEL_PX))
@@ -176,17 +178,20 @@ def _correlation(patch: _Patch, residual: Array) -> float:
     return factor
 
 
-def _bending(patch: _Patch, picture: _Picture, variance: float) -> float:
-    """Return by how much more than its noise the outline alone would move the corners: paper that is not flat.
+def _bending_px(patch: _Patch, picture: _Picture) -> float:
+    """Return by how many pixels, as a root mean square, the outline alone would move the corners, beyond its noise.
 
-    The interior of a bent tag, or of one that something covers at its rim, fits another square than its outline.
+    The interior of a tag on bent paper, or of one that something covers at its rim, fits another square than its
+    outline; which of the two is the tag's cannot be told.
     """
-    slope, residual = picture.slope[patch.is_outline, :8], picture.residual[patch.is_outline]
-    if len(residual) <= 8:
-        return 1.0
-    gradient = slope.T @ residual
-    chi2 = float(gradient @ np.linalg.pinv(slope.T @ slope, hermitian=True) @ gradient) / variance
-    return max(1.0, chi2 / 8)
+    slope = picture.slope[patch.is_outline, :8]
+    scores = slope * picture.residual[patch.is_outline, None]
+    if len(scores) <= 8:
+        return 0.0
+    total = scores.sum(axis=0)
+    step = np.linalg.pinv(slope.T @ slope, hermitian=True) @ total
+    excess = float(total @ np.linalg.pinv(scores.T @ scores, hermitian=True) @ total) / 8
+    return math.sqrt(max(1.0 - 1.0 / max(excess, 1e-9), 0.0) * float(np.mean(step**2)))
 
 
 def _patch(grey: Image, camera: Camera, family: Family, start: CornerFit) -> _Patch:
