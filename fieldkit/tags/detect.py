@@ -28,8 +28,8 @@ LINES_SIGMA_PX = 0.4
 COARSE_SIGMA_PX = 0.6
 # Blur from which a pattern's fit starts where no edge shows it
 SHARP_BLUR_PX = 0.7
-# How far a fit may move a detector's corners
-MAX_MOVE_PX, MAX_MOVE_CELLS = 2.0, 0.7
+# How far a fit may move a detector's corners, in pixels and in cells of the longest edge
+MAX_MOVE_PX, MAX_MOVE_CELLS = 2.0, 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,8 @@ def detect(
 def _refine(grey: Image, camera: Camera, family: Family, found: FoundTag) -> TagDetection:
     """Fit the tag's pattern, from lines along its edges; else keep the lines' corners, else the detector's."""
     coarse = TagDetection(found.id, family.name, found.corners_px, COARSE_SIGMA_PX)
-    cell_px = coarse.edge_px / family.cells
+    edges = np.linalg.norm(found.corners_px - np.roll(found.corners_px, -1, axis=0), axis=1)
+    cell_px = float(edges.max()) / family.cells
     limit = max(MAX_MOVE_PX, MAX_MOVE_CELLS * cell_px)
     fit = fit_square(grey, camera, found.corners_px, family.cells, is_reversed=family.is_reversed)
     if fit is not None and _moved(camera, fit, found) > limit:
