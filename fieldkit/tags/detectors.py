@@ -68,6 +68,8 @@ def _find_opencv(grey: Image, family: Family) -> list[FoundTag]:
     assert family.opencv is not None
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+    # Its default loses whole tags up to 20 px away from the border
+    settings.minDistanceToBorder = 0
     scale = min(1.0, SEARCH_EDGE_PX / max(grey.shape))
     small = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(family.opencv), settings)

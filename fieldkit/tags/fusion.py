@@ -73,7 +73,12 @@ class TagFix:
     @property
     def is_certain(self) -> bool:
         """Whether the sightings decide between the two solutions, and these have not merged into one."""
-        return self.evidence > CERTAIN and tilt_is_known(self.covariance)
+        return self.evidence > CERTAIN and tilt_is_known(self.covariance * self.repeated)
+
+    @property
+    def repeated(self) -> int:
+        """How many sightings count as one: all that entered, where their directions span less than 15 deg."""
+        return 1 if self.span_rad >= SPAN_RAD else sum(self.used)
 
 
 def fuse_sightings(
@@ -330,13 +335,12 @@ def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], us
             covariance = _covariance(problem.information(other, used, fix.scale)) * factor
         except np.linalg.LinAlgError:
             continue
-        repeated = 1 if fix.span_rad >= SPAN_RAD else int(used.sum())
         return dataclasses.replace(
             fix,
             alternative=other,
             alternative_covariance=covariance,
             ambiguity=float(np.sqrt(min(best, cost) / max(best, cost, 1e-12))),
-            evidence=(cost - best) / factor / repeated,
+            evidence=(cost - best) / factor / fix.repeated,
         )
     return fix
 
