@@ -99,6 +99,8 @@ def tags_calibrate(
     out: Path,
     size_m: Repeated[tuple[str, ...]],
     camera: Path | None = None,
+    family: Repeated[tuple[str, ...]] = ("tag36h11",),
+    detector: Literal["pupil", "opencv"] | None = None,
     json: bool = False,
     force: bool = False,
 ) -> None:
@@ -110,6 +112,8 @@ def tags_calibrate(
         out: tags.toml to write
         size_m: edge length of the black square in m, or ID:SIZE for one tag; may be repeated
         camera: camera.toml of the photos, where photos.toml names none
+        family: tag family; may be repeated
+        detector: what finds the tags; by default pupil, and opencv for tag36h10
         json: print JSON
         force: replace an existing file
     """
@@ -118,7 +122,10 @@ def tags_calibrate(
 
     store.refuse_existing(out, force=force, kind="file")
     with ProgressBars() as progress:
-        tags = calibrate_tags(photos, map, camera=camera, sizes_m=parse_sizes(size_m), progress=progress)
+        sizes_m = parse_sizes(size_m)
+        tags = calibrate_tags(
+            photos, map, camera=camera, sizes_m=sizes_m, families=family, detector=detector, progress=progress
+        )
     store.write_tags(out, tags)
     if json:
         print_json(_tags_json(tags))

@@ -17,6 +17,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
 from fieldkit.store import read_camera, read_photos
 from fieldkit.tags import TagDetection, detect
+from fieldkit.tags.detectors import find_detector
 from fieldkit.tags.families import FAMILIES
 from fieldkit.types import Image, TagPhoto
 
@@ -186,8 +187,12 @@ def find_tags(
     sizes_m: Mapping[int | None, float],
     families: Sequence[str],
     progress: Progress | None,
+    *,
+    detector: str | None = None,
 ) -> tuple[list[Shot], list[TagPhoto]]:
     """Find the tags in photos; also return a verdict on each that cannot be used. Raises TagError when none can."""
+    for family in families:
+        find_detector(family, detector)
     shots: list[Shot] = []
     rejected: list[TagPhoto] = []
     seen: set[int] = set()
@@ -195,7 +200,7 @@ def find_tags(
         if progress is not None:
             progress("find tags", number + 1, len(listed))
         image = read_photo(photo)
-        found = [] if image is None else detect(image, photo.camera, families=families)
+        found = [] if image is None else detect(image, photo.camera, families=families, detector=detector)
         if not found:
             reason = "cannot be read as an image" if image is None else f"no tag found{describe_blur(image)}"
             rejected.append(TagPhoto(photo.file, -1, used=False, reason=reason, visit=photo.visit))

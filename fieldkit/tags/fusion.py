@@ -192,6 +192,12 @@ class _Problem:
         result: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         return result
 
+    def are_in_front(self, ref_from_tag: Pose, used: Mask) -> bool:
+        """Tell whether every corner lies in front of every camera that is used."""
+        x_in_ref = ref_from_tag.apply(self.points)
+        depth = np.einsum("nj,kj->nk", self.rotation[used, 2], x_in_ref) + self.translation[used, 2, None]
+        return bool((depth > 1e-3).all())
+
     def weights(self, by_cam: Array, scale: float) -> tuple[Array, Array]:
         """Return the inverse covariance (n, 8, 8) of each sighting's residuals and its log determinant (n,)."""
         total = self.noise + scale**2 * by_cam @ self.covariance @ by_cam.transpose(0, 2, 1)
@@ -328,8 +334,9 @@ def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], us
     best = float(problem.chi2(fix.ref_from_tag, fix.scale)[used].sum())
     mirrored = _mirrored(fix.ref_from_tag, problem.directions(fix.ref_from_tag)[used].mean(axis=0))
     starts = [p for p in (mirrored, *others) if _turned(fix.ref_from_tag, p) > SAME_RAD]
-    minima = (problem.minimise(start, used, fix.scale) for start in starts[:8])
-    found = [(float(problem.chi2(p, fix.scale)[used].sum()), p) for p in minima if _turned(fix.ref_from_tag, p) > 0.02]
+    minima = [problem.minimise(start, used, fix.scale) for start in starts[:8]]
+    minima = [p for p in minima if _turned(fix.ref_from_tag, p) > 0.02 and problem.are_in_front(p, used)]
+    found = [(float(problem.chi2(p, fix.scale)[used].sum()), p) for p in minima]
     for cost, other in sorted(found, key=lambda f: f[0]):
         try:
             covariance = _covariance(problem.information(other, used, fix.scale)) * factor
