@@ -26,7 +26,7 @@ MAX_SAMPLES = 200000
 # Most nodes for the part of the blur that is not along the tag's axes, and how far they reach in its deviations
 MAX_NODES, NODE_REACH = 31, 3.5
 # Only pixels that are nearer to an edge of a cell than so many deviations of the blur tell where it is
-NEAR_BLURS, NEAR_PX = 3.0, 1.5
+NEAR_BLURS, NEAR_PX = 3.0, 2.0
 # Deviation of a pixel's own width
 PIXEL_PX = math.sqrt(1.0 / 12.0)
 # Light that changes across the tag: constant and two slopes for black, the same for white, and what lies beyond it
@@ -38,7 +38,9 @@ BLACK, MIN_TONE, MAX_TONE = 0.05, 0.2, 2.0
 # Corners that move farther than the pixels near an edge start again from where they are, so many times
 MAX_ROUNDS = 3
 # Residuals beyond this share of the contrast weigh less and less: glare, dirt; but not what the blur's shape leaves
-OUTLIER = 0.25
+OUTLIER = 0.3
+# Blur that the instrument adds to the picture's own, in pixels
+WIDER_PX = 0.7
 # A residual of more than this share of the contrast is no picture of this tag
 MAX_MISFIT = 0.2
 
@@ -119,9 +121,8 @@ def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> C
     shape, damping = _Shape(start.flat, math.log(_lens_blur(start.blur_px)), 1.0), 1e-4
     weights = np.ones(len(patch.values))
     picture = _picture(patch, family, cells, shape, weights)
-    tolerated = max(4.0 * picture.scale, OUTLIER * _contrast(patch))
     for _ in range(15):
-        weights = 1.0 / (1.0 + (picture.residual / tolerated) ** 4)
+        weights = _weights(patch, picture)
         design = picture.design
         normal, gradient = design.T @ (design * weights[:, None]), design.T @ (weights * picture.residual)
         step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), gradient, rcond=None)[0]
@@ -131,29 +132,58 @@ def _fit_once(patch: _Patch, family: Family, tag_id: int, start: CornerFit) -> C
         new = _picture(patch, family, cells, moved, weights)
         if float(weights @ new.residual**2) <= float(weights @ picture.residual**2):
             shape, picture, damping = moved, new, max(damping / 10, 1e-9)
-            tolerated = max(4.0 * picture.scale, OUTLIER * _contrast(patch))
             if float(np.abs(step[:8]).max()) < 1e-3:
                 break
         elif damping > 1e3:
             break
         else:
             damping *= 10
-    return _judged(patch, shape, picture, weights)
+    return _polished(patch, family, cells, shape, picture)
 
 
-def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weights: Array) -> CornerFit | None:
-    design, count = picture.design, float(weights.sum())
-    freedom = count / max(count - design.shape[1], 1.0)
-    if math.sqrt(freedom * float(weights @ picture.residual**2) / count) > MAX_MISFIT * _contrast(patch):
+def _polished(patch: _Patch, family: Family, cells: Array, shape: _Shape, picture: _Picture) -> CornerFit | None:
+    """Solve for corners whose residuals, summed across edges, vanish; return them with their covariance.
+
+    Least squares trusts the few pixels on which a sharp edge falls, and errs as the picture of an edge there differs
+    from the model's. Summed with the slopes of a more blurred picture (an instrument), what the model's blur does not
+    explain cancels from one side of an edge to the other.
+    """
+    weights = _weights(patch, picture)
+    wide = _Shape(shape.corners, math.log(math.hypot(math.exp(shape.log_blur), PIXEL_PX, WIDER_PX)), shape.tone)
+    instrument = picture.design
+    instrument[:, :8] = _picture(patch, family, cells, wide, weights).slope[:, :8]
+    weighted = instrument * weights[:, None]
+    for _ in range(4):
+        step = np.linalg.lstsq(weighted.T @ picture.design, weighted.T @ picture.residual, rcond=None)[0]
+        if np.abs(step[:8]).max() > 2.0:
+            return None
+        shape = shape.moved(step)
+        picture = _picture(patch, family, cells, shape, weights)
+        if float(np.abs(step[:8]).max()) < 1e-3:
+            break
+    return _judged(patch, shape, picture, weighted)
+
+
+def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weighted: Array) -> CornerFit | None:
+    count, parameters = picture.design.shape
+    freedom = count / (count - parameters)
+    if math.sqrt(freedom * float(np.mean(picture.residual**2))) > MAX_MISFIT * _contrast(patch):
         return None
     # Residuals differ from pixel to pixel: at edges more than elsewhere (White 1980)
-    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]), hermitian=True)[:8]
-    scores = design * (weights * picture.residual)[:, None]
+    inverse = np.linalg.pinv(weighted.T @ picture.design)[:8]
+    scores = weighted * picture.residual[:, None]
     factor = freedom * _correlation(patch, picture.residual)
-    covariance = inverse @ (scores.T @ scores) @ inverse.T * factor + _bending_px(patch, picture) ** 2 * np.eye(8)
+    bending = _bending_px(picture.slope[patch.is_outline, :8], weighted[patch.is_outline, :8], scores[patch.is_outline, :8])
+    covariance = inverse @ (scores.T @ scores) @ inverse.T * factor + bending**2 * np.eye(8)
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         return None
     return CornerFit(shape.corners, covariance, math.hypot(math.exp(shape.log_blur), PIXEL_PX))
+
+
+def _weights(patch: _Patch, picture: _Picture) -> Array:
+    tolerated = max(4.0 * picture.scale, OUTLIER * _contrast(patch))
+    weights: Array = 1.0 / (1.0 + (picture.residual / tolerated) ** 8)
+    return weights
 
 
 def _lens_blur(blur_px: float) -> float:
@@ -178,18 +208,16 @@ def _correlation(patch: _Patch, residual: Array) -> float:
     return factor
 
 
-def _bending_px(patch: _Patch, picture: _Picture) -> float:
+def _bending_px(slope: Array, weighted: Array, scores: Array) -> float:
     """Return by how many pixels, as a root mean square, the outline alone would move the corners, beyond its noise.
 
     The interior of a tag on bent paper, or of one that something covers at its rim, fits another square than its
-    outline; which of the two is the tag's cannot be told.
+    outline; which of the two is the tag's cannot be told. All (n, 8) are of the outline's pixels.
     """
-    slope = picture.slope[patch.is_outline, :8]
-    scores = slope * picture.residual[patch.is_outline, None]
     if len(scores) <= 8:
         return 0.0
     total = scores.sum(axis=0)
-    step = np.linalg.pinv(slope.T @ slope, hermitian=True) @ total
+    step = np.linalg.pinv(weighted.T @ slope) @ total
     excess = float(total @ np.linalg.pinv(scores.T @ scores, hermitian=True) @ total) / 8
     return math.sqrt(max(1.0 - 1.0 / max(excess, 1e-9), 0.0) * float(np.mean(step**2)))
 
@@ -287,7 +315,10 @@ def _picture(patch: _Patch, family: Family, cells: Array, shape: _Shape, weights
     ink, by_ink, by_tone = _toned(ink, shape.tone)
     place = (places - family.cells / 2) / family.cells
     ramps = np.column_stack([np.ones(len(place)), place])
-    light = np.hstack([ramps, ramps * ink[:, None], 1.0 - _within(family, places, axes)[:, None]])
+    beyond = 1.0 - _within(family, places, axes)
+    if beyond.max() < 1e-3:
+        beyond[:] = 0.0
+    light = np.hstack([ramps, ramps * ink[:, None], beyond[:, None]])
     root = np.sqrt(weights)
     amount = np.linalg.lstsq(light * root[:, None], patch.values * root, rcond=None)[0]
     white = ramps @ amount[3:6]
