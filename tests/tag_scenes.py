@@ -186,4 +186,5 @@ def to_light(grey: Array) -> Array:
 
 def to_grey(light: Array) -> Array:
     """Return sRGB's grey values of light (0..1)."""
-    return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.clip(light, 0.0031308, None) ** (1 / 2.4) - 0.055)
+    bright = 1.055 * np.clip(light, 0.0031308, None) ** (1 / 2.4) - 0.055
+    return 255 * np.where(light <= 0.0031308, 12.92 * light, bright)

@@ -127,8 +127,14 @@ def normalised(errors: list[Array], found: list[TagDetection], *, floor: bool) -
 
 @pytest.mark.parametrize(
     ("distance_m", "slant_deg", "noise", "blur_px"),
-    [(0.6, (0, 30), 3.0, 0.7), (2.0, (0, 30), 3.0, 0.7), (2.0, (0, 30), 3.0, 1.5), (3.5, (0, 20), 3.0, 0.7), (0.8, (55, 68), 3.0, 0.7)],
-)  # fmt: skip
+    [
+        (0.6, (0, 30), 3.0, 0.7),
+        (2.0, (0, 30), 3.0, 0.7),
+        (2.0, (0, 30), 3.0, 1.5),
+        (3.5, (0, 20), 3.0, 0.7),
+        (0.8, (55, 68), 3.0, 0.7),
+    ],
+)
 def test_corner_noise_is_what_the_corners_err_by(
     rng: np.random.Generator, distance_m: float, slant_deg: tuple[float, float], noise: float, blur_px: float
 ) -> None:

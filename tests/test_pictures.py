@@ -39,7 +39,10 @@ def picture() -> Image:
     return facing()
 
 
-def save(path: Path, image: Image, tags: dict[int, object] | None = None, shot: dict[int, object] | None = None) -> None:
+Tags = dict[int, object]
+
+
+def save(path: Path, image: Image, tags: Tags | None = None, shot: Tags | None = None) -> None:
     path.parent.mkdir(exist_ok=True)
     exif = PillowImage.Exif()
     exif.update(tags or {})
@@ -58,8 +61,8 @@ def find(folder: Path) -> tuple[list[Shot], list[TagPhoto]]:
 
 
 def test_exif_is_read_without_the_pixels(tmp_path: Path, picture: Image) -> None:
-    tags, shot = {MAKE: "Acme\0", MODEL: " A1  b", ORIENTATION: 6}, {FOCAL: 4.25, FOCAL_FILM: 26, LENS: "wide", ZOOM: 2.0}
-    save(tmp_path / "a.jpg", picture, tags, shot)
+    tags = {MAKE: "Acme\0", MODEL: " A1  b", ORIENTATION: 6}
+    save(tmp_path / "a.jpg", picture, tags, {FOCAL: 4.25, FOCAL_FILM: 26, LENS: "wide", ZOOM: 2.0})
     header = read_header(tmp_path / "a.jpg")
     assert header is not None
     assert (header.width, header.height, header.orientation, header.bits) == (640, 480, 6, 8)
@@ -98,9 +101,8 @@ def test_a_calibration_of_turned_photos_is_refused_and_says_so(tmp_path: Path, p
     turned = Camera("PINHOLE", 480, 640, (552.0, 552.0, 240.0, 320.0))
     folder = folder_of(tmp_path / "exif", camera=turned)
     save(folder / "a.jpg", picture, {ORIENTATION: 6})
-    with pytest.raises(
-        TagError, match=r"a\.jpg: 640x480 pixels are stored, which EXIF \(orientation 6\) shows turned to 480x640; expected"
-    ):
+    shown = r"a\.jpg: 640x480 pixels are stored, which EXIF \(orientation 6\) shows turned to 480x640; expected"
+    with pytest.raises(TagError, match=shown):
         list_photos(folder, None)
     folder = folder_of(tmp_path / "plain", camera=turned)
     save(folder / "a.jpg", picture)

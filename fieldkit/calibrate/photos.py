@@ -173,7 +173,7 @@ def _check_once(folder: Path, listed: Sequence[Photo]) -> None:
 
 
 def read_photo(photo: Photo) -> Image | None:
-    """Read a photo's stored pixels in grey, None where it is no image; raises TagError when not of its camera's size."""
+    """Read a photo's stored pixels in grey, None where it is no image; raises TagError for another size."""
     image = pictures.read_grey(photo.path)
     if image is not None:
         header = pictures.PhotoHeader(image.shape[1], image.shape[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -41,7 +41,7 @@ WHITE_QUANTILE = 0.999
 
 @dataclasses.dataclass(frozen=True)
 class PhotoHeader:
-    """The stored size in pixels, EXIF's orientation (1 upright), camera, lens, and focal lengths in mm; None unknown."""
+    """Stored size in pixels, EXIF's orientation (1 upright), camera, lens, focal lengths in mm; None unknown."""
 
     width: int
     height: int
@@ -112,18 +112,21 @@ def _positive(value: object) -> float | None:
     return number if math.isfinite(number) and number > 0 else None
 
 
+MUST_AGREE: dict[str, Callable[[PhotoHeader], str | None]] = {
+    "sizes": lambda h: f"{h.width}x{h.height}",
+    "cameras": lambda h: h.camera,
+    "lenses": lambda h: h.lens,
+    "focal lengths": lambda h: None if h.focal_mm is None else f"{h.focal_mm:g} mm",
+    "digital zooms": lambda h: None if h.zoom is None else f"{h.zoom:g}x",
+}
+
+
 def refuse_mixture(headers: Mapping[str, PhotoHeader], camera_path: Path) -> None:
     """Raise TagError where photos that share a camera file differ in size, camera, lens or focal length.
 
     What a photo's EXIF does not say is not compared.
     """
-    for what, of in (
-        ("sizes", lambda h: f"{h.width}x{h.height}"),
-        ("cameras", lambda h: h.camera),
-        ("lenses", lambda h: h.lens),
-        ("focal lengths", lambda h: h.focal_mm and f"{h.focal_mm:g} mm"),
-        ("digital zooms", lambda h: h.zoom and f"{h.zoom:g}x"),
-    ):
+    for what, of in MUST_AGREE.items():
         groups: dict[str, list[str]] = {}
         for file, header in headers.items():
             value = of(header)
@@ -132,12 +135,13 @@ def refuse_mixture(headers: Mapping[str, PhotoHeader], camera_path: Path) -> Non
         if len(groups) > 1 and not (what == "focal lengths" and _nearly_same(headers.values())):
             named = ", ".join(f"{value} ({_some(files)})" for value, files in groups.items())
             raise TagError(
-                f"{camera_path}: its photos are of {len(groups)} {what}: {named}; expected those of one camera, lens and zoom",
+                f"{camera_path}: its photos are of {len(groups)} {what}: {named}; expected those of one camera, lens "
+                "and zoom",
                 hint="calibrate each camera and name its file for each photo in photos.toml, or leave photos out",
             )
 
 
-def _nearly_same(headers: Sequence[PhotoHeader]) -> bool:
+def _nearly_same(headers: Iterable[PhotoHeader]) -> bool:
     focal = [h.focal_mm for h in headers if h.focal_mm is not None]
     return max(focal) <= (1 + SAME_FOCAL) * min(focal)
 
@@ -192,4 +196,5 @@ def read_grey(path: Path) -> Image | None:
     if image.dtype == np.uint8:
         return np.asarray(image)
     white = max(float(np.quantile(image, WHITE_QUANTILE)), 1.0)
-    return np.clip(np.round(image.astype(np.float32) * (255.0 / white)), 0, 255).astype(np.uint8)
+    grey: Image = np.clip(np.round(image.astype(np.float32) * (255.0 / white)), 0, 255).astype(np.uint8)
+    return grey

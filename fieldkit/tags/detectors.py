@@ -104,6 +104,8 @@ def find_detector(family: str, name: str | None = None) -> TagDetector:
         raise TagError(f"unknown tag detector {name!r}", hint=suggestion(name, list(DETECTORS)))
     if family not in DETECTORS[name].families:
         able = ", ".join(d.name for d in DETECTORS.values() if family in d.families)
-        raise TagError(f"{name} finds no {family}; expected one of {', '.join(DETECTORS[name].families)}",
-                       hint=f"take {able}, or leave the choice to the family")
+        raise TagError(
+            f"{name} finds no {family}; expected one of {', '.join(DETECTORS[name].families)}",
+            hint=f"take {able}, or leave the choice to the family",
+        )
     return DETECTORS[name]

@@ -52,8 +52,8 @@ class TagFix:
     better solution is not the one that all together chose. ``scale`` multiplies the stated standard deviations of the
     camera poses: their noise as the sightings show it. ``span_rad`` is the largest angle between the directions from
     which the tag is seen. ``alternative`` is the other solution, when there is one, ``ambiguity`` the ratio of the two
-    residuals, and ``evidence`` the difference of their chi-squares, of all sightings together where they span 15 deg, else
-    of the average one: from one direction, more sightings repeat the same error of a lens or of bent paper.
+    residuals, and ``evidence`` the difference of their chi-squares: of all sightings together where they span 15 deg,
+    else of the average one, since from one direction they repeat the same error of a lens or of bent paper.
     """
 
     ref_from_tag: Pose
@@ -64,11 +64,11 @@ class TagFix:
     ambiguities: tuple[float, ...]
     flipped: tuple[bool, ...]
     scale: float
-    span_rad: float = 0.0
     alternative: Pose | None = None
     alternative_covariance: Array | None = None
     ambiguity: float = 0.0
     evidence: float = float("inf")
+    span_rad: float = 0.0
 
     @property
     def is_certain(self) -> bool:
@@ -132,7 +132,7 @@ def _fuse(
         tuple(s.ambiguity for s in solutions),
         tuple(_is_flipped(s, o, best) for s, o in zip(sightings, solutions, strict=True)),
         scale,
-        _span(problem.directions(best)[used]),
+        span_rad=_span(problem.directions(best)[used]),
     )
     return _with_alternative(fix, problem, votes.others, used, factor)
 

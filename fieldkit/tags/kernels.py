@@ -51,8 +51,8 @@ def blurred_pattern(
             for axis in range(2):
                 x, s, width = places[i, axis] + nodes[k] * aslant[i, axis], axial[i, axis], widths[i, axis]
                 reach = FAR * s + 0.5 * width
-                first[axis] = min(max(int(math.floor(x - reach)), 0), len(cells) - 1)
-                last[axis] = min(max(int(math.floor(x + reach)), 0), len(cells) - 1)
+                first[axis] = min(max(math.floor(x - reach), 0), len(cells) - 1)
+                last[axis] = min(max(math.floor(x + reach), 0), len(cells) - 1)
                 below, density, moment = 0.0, 0.0, 0.0
                 for c in range(first[axis], last[axis] + 1):
                     above, next_density, next_moment = 1.0, 0.0, 0.0

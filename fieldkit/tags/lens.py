@@ -31,7 +31,7 @@ def bend_slope(camera: Camera, flat: Array) -> Array:
 
 def flat_covariance(camera: Camera, pixels: Array, covariance: Array) -> Array:
     """Carry the covariance (2n, 2n) of pixels (n, 2) in the image to undistorted pixels."""
-    inverse = np.linalg.inv(bend_slope(camera, flatten(camera, pixels)))
+    inverse: Array = np.linalg.inv(bend_slope(camera, flatten(camera, pixels))).astype(np.float64)
     return _carry(inverse, covariance)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,13 +60,13 @@ class _Patch:
 
 @dataclasses.dataclass(frozen=True)
 class _Shape:
-    """What is fitted beside the light: corners (4, 2) in undistorted pixels, log of the blur in pixels, and the tone."""
+    """What is fitted beside the light: corners (4, 2) in undistorted pixels, log of the blur in pixels, tone."""
 
     corners: Array
     log_blur: float
     tone: float
 
-    def moved(self, step: Array) -> _Shape:
+    def moved(self, step: NDArray[np.floating[Any]]) -> _Shape:
         log_blur = self.log_blur + float(np.clip(step[8], -0.5, 0.5))
         tone = float(np.clip(self.tone + np.clip(step[9], -0.3, 0.3), MIN_TONE, MAX_TONE))
         return _Shape(self.corners + step[:8].reshape(4, 2), float(np.clip(log_blur, -2.0, 3.5)), tone)
@@ -173,7 +174,7 @@ def _judged(patch: _Patch, shape: _Shape, picture: _Picture, weighted: Array) ->
     inverse = np.linalg.pinv(weighted.T @ picture.design)[:8]
     scores = weighted * picture.residual[:, None]
     factor = freedom * _correlation(patch, picture.residual)
-    bending = _bending_px(picture.slope[patch.is_outline, :8], weighted[patch.is_outline, :8], scores[patch.is_outline, :8])
+    bending = _bending_px(*(a[patch.is_outline, :8] for a in (picture.slope, weighted, scores)))
     covariance = inverse @ (scores.T @ scores) @ inverse.T * factor + bending**2 * np.eye(8)
     if not np.isfinite(covariance).all() or not (np.linalg.eigvalsh(covariance) > 0).all():
         return None
@@ -257,7 +258,7 @@ def _near(family: Family, start: CornerFit, flat: Array, flat_by_pixel: Array) -
 
 @dataclasses.dataclass(frozen=True)
 class _Axes:
-    """What blurs n places, seen in cells: the lens's Gaussian of the image, and the pixel that averages over its square.
+    """What blurs n places, seen in cells: the lens's Gaussian of the image, and the pixel that averages its square.
 
     With A (n, 2, 2) = d(place)/d(pixel), the Gaussian has the covariance S = blur^2 A A' in the tag's axes. With its
     correlation r, (1 - |r|) diag S acts along the axes, where a blurred pattern is a product of error functions; the

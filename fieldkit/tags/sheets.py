@@ -55,8 +55,9 @@ class _Page:
 def write_sheets(path: Path, ids: Sequence[int], *, size_m: float, family: str, paper: str) -> None:
     """Write a PDF with one tag per page, at true scale; ``size_m`` is the edge length of the black square.
 
-    Raises TagError for a family without a closed black square, an unknown paper, an id that the family does not have or that is given twice, a
-    size that is no length, and a tag that does not fit the paper with its quiet margin, ruler and text.
+    Raises TagError for a family without a closed black square, an unknown paper, an id that the family does not have or
+    that is given twice, a size that is no length, and a tag that does not fit the paper with its quiet margin, ruler
+    and text.
     """
     if paper not in PAPERS:
         raise TagError(f"unknown paper {paper!r}", hint=suggestion(paper, list(PAPERS)))
