@@ -64,8 +64,8 @@ def detect(
 
     Corners come from the tag's whole pattern, fitted in undistorted coordinates; the photo itself is not resampled.
     Their covariance is what the fit's residuals show. ``detector`` is one of `DETECTORS`; without it each family has
-    its own. Raises TagError for an unknown family or detector, one that does not find the family, or an image of another
-    size than the camera.
+    its own. Raises TagError for an unknown family or detector, one that does not find the family, or an image of
+    another size than the camera.
     """
     chosen = [(find_family(family), find_detector(family, detector)) for family in dict.fromkeys(families)]
     height, width = image.shape[:2]

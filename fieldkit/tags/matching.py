@@ -340,7 +340,8 @@ def _toned(ink: Array, tone: float) -> tuple[Array, Array, Array]:
 
     def curve(exponent: float) -> Array:
         span = (1.0 + BLACK) ** exponent - BLACK**exponent
-        return ((ink + BLACK) ** exponent - BLACK**exponent) / span
+        values: Array = ((ink + BLACK) ** exponent - BLACK**exponent) / span
+        return values
 
     by_ink = tone * (ink + BLACK) ** (tone - 1.0) / ((1.0 + BLACK) ** tone - BLACK**tone)
     return curve(tone), by_ink, (curve(tone + 1e-4) - curve(tone - 1e-4)) / 2e-4

@@ -1,8 +1,8 @@
 """Whether a tag's planar ambiguity is ever decided wrongly, through rendered images: `make bench`.
 
 Tags of 0.1365 m in a VGA camera (f 552), from 0.5 to 4 m, traced with 8x8 rays per pixel, blurred in light with 0.7 px,
-with grey noise of 2. Near-frontal: 0..20 deg between the tag's normal and the line of sight; grazing: 55..72 deg. Groups
-of three are the hard ones: 3 to 4 m, 2..12 deg, grey noise of 8, and the middle sighting alone leaves it open.
+with grey noise of 2. Near-frontal: 0..20 deg between the tag's normal and the line of sight; grazing: 55..72 deg.
+Groups of three are the hard ones: 3 to 4 m, 2..12 deg, grey noise of 8, and the middle sighting alone leaves it open.
 The table is that of docs/detection.md. Nothing here passes or fails but a wrong certainty.
 """
 
