@@ -25,10 +25,9 @@ log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 
-# Cells of fewer pixels are mixed by the lens: their edges, and with them the corners, shift
+# Smaller tags show little of their tilt, and are taken for others more easily
 MIN_CELL_PX = 3.0
-# Edges are read half a cell to either side. In renders the corners err by more than three of their stated sigmas once
-# the blur exceeds this share of a cell: the neighbours come in
+# Blur of this share of a cell mixes it with its neighbours
 MAX_BLUR_CELLS = 0.3
 # Share of pixels that lie on steep edges: of a tag, of a whole photo
 TAG_EDGES, PHOTO_EDGES = 0.005, 0.0002
