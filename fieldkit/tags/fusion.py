@@ -28,6 +28,8 @@ CERTAIN = 20.0
 SPAN_RAD = math.radians(15.0)
 # A candidate that is turned by less than this (rad) is no other solution
 SAME_RAD = 0.03
+# One sighting of a decided pose does not outweigh those that leave it open
+MOST_EVIDENCE = 2 * CERTAIN
 # What the stated noise of the cameras may be multiplied by
 SCALES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
@@ -53,7 +55,7 @@ class TagFix:
     camera poses: their noise as the sightings show it. ``span_rad`` is the largest angle between the directions from
     which the tag is seen. ``alternative`` is the other solution, when there is one, ``ambiguity`` the ratio of the two
     residuals, and ``evidence`` the difference of their chi-squares: of all sightings together where they span 15 deg,
-    else of the average one, since from one direction they repeat the same error of a lens or of bent paper.
+    else at most that of the average one by itself: from one direction they repeat an error of lens or paper.
     """
 
     ref_from_tag: Pose
@@ -134,7 +136,8 @@ def _fuse(
         scale,
         span_rad=_span(problem.directions(best)[used]),
     )
-    return _with_alternative(fix, problem, votes.others, used, factor)
+    fix = _with_alternative(fix, problem, votes.others, used, factor)
+    return fix if fix.span_rad >= SPAN_RAD else _as_one(fix, sightings, solutions)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -347,9 +350,49 @@ def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], us
             alternative=other,
             alternative_covariance=covariance,
             ambiguity=float(np.sqrt(min(best, cost) / max(best, cost, 1e-12))),
-            evidence=(cost - best) / factor / fix.repeated,
+            evidence=(cost - best) / factor,
         )
     return fix
+
+
+def _as_one(fix: TagFix, sightings: Sequence[Sighting], solutions: Sequence[TagSolution]) -> TagFix:
+    """Return a fix whose evidence is at most that of its average sighting by itself, with its other solution."""
+    own = [
+        (-1.0 if flipped else 1.0) * _evidence(s, o)
+        for s, o, flipped, used in zip(sightings, solutions, fix.flipped, fix.used, strict=True)
+        if used
+    ]
+    fix = dataclasses.replace(fix, evidence=min(fix.evidence, float(np.mean(np.minimum(own, MOST_EVIDENCE)))))
+    if fix.alternative is not None or fix.evidence > CERTAIN:
+        return fix
+    # Together they have no other minimum: that of the sighting that knows least
+    open_ones = [
+        (s, o) for s, o, u in zip(sightings, solutions, fix.used, strict=True) if u and o.alternative is not None
+    ]
+    if not open_ones:
+        return fix
+    sighting, solution = min(open_ones, key=lambda p: _evidence(*p))
+    options = [
+        (solution.cam_from_tag, solution.covariance),
+        (solution.alternative, solution.alternative_covariance),
+    ]
+    placed = [(sighting.ref_from_cam * p, p, c) for p, c in options if p is not None and c is not None]
+    other, cam_from_tag, covariance = max(placed, key=lambda p: _turned(fix.ref_from_tag, p[0]))
+    return dataclasses.replace(
+        fix,
+        alternative=other,
+        alternative_covariance=compose_covariance(sighting.covariance, cam_from_tag, covariance),
+        ambiguity=solution.ambiguity,
+    )
+
+
+def _evidence(sighting: Sighting, solution: TagSolution) -> float:
+    """Return the difference of chi-square of a sighting's own two solutions: none where they merged into one."""
+    if solution.alternative is None:
+        return math.inf if tilt_is_known(solution.covariance) else 0.0
+    better, other = (8 * (r / sighting.detection.sigma_px) ** 2 for r in (solution.rms_px, solution.alternative_rms_px))
+    # Two degrees of freedom remain to show that the corners are noisier than they say
+    return (other - better) / max(1.0, better / 2)
 
 
 def _turned(one: Pose, two: Pose) -> float:
