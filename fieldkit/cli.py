@@ -102,6 +102,8 @@ def tags_calibrate(
     size_m: Repeated[tuple[str, ...]],
     camera: Path | None = None,
     check_map: Path | None = None,
+    family: Repeated[tuple[str, ...]] = ("tag36h11",),
+    detector: Literal["pupil", "opencv"] | None = None,
     json: bool = False,
     force: bool = False,
 ) -> None:
@@ -114,6 +116,8 @@ def tags_calibrate(
         size_m: edge length of the black square in m, or ID:SIZE for one tag; may be repeated
         camera: camera.toml of the photos, where photos.toml names none
         check_map: another map of the place, such as one of another feature: compare where it localizes the photos
+        family: tag family; may be repeated
+        detector: what finds the tags; by default pupil, and opencv for tag36h10
         json: print JSON
         force: replace an existing file
     """
@@ -123,10 +127,21 @@ def tags_calibrate(
     store.refuse_existing(out, force=force, kind="file")
     sizes_m, second = parse_sizes(size_m), None
     with ProgressBars() as progress:
-        tags = calibrate_tags(photos, map, camera=camera, sizes_m=sizes_m, progress=progress)
+        tags = calibrate_tags(
+            photos, map, camera=camera, sizes_m=sizes_m, families=family, detector=detector, progress=progress
+        )
         store.write_tags(out, tags)
         if check_map is not None:
-            second = check_in_second_map(photos, map, check_map, camera=camera, sizes_m=sizes_m, progress=progress)
+            second = check_in_second_map(
+                photos,
+                map,
+                check_map,
+                camera=camera,
+                sizes_m=sizes_m,
+                families=family,
+                detector=detector,
+                progress=progress,
+            )
     if json:
         print_json(tags_json(tags) | ({} if second is None else {"second_map": second_json(second)}))
         return

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Array, Pose, Trajectory, exp, yaw_pose
-from fieldkit.tags import draw_tag, tag_corners
+from fieldkit.tags import FAMILIES, draw_tag, tag_corners
 from fieldkit.types import Frame, Image, Recording, Start, TagMap, TagPose, View, Visit
 
 VGA = Camera("PINHOLE", 640, 480, (552.0, 552.0, 320.0, 240.0))
@@ -24,26 +24,39 @@ FORWARD = Pose.from_components([0.3, 0.0, 0.5], Rotation.from_matrix([[0, 0, 1],
 def render_tag(
     camera: Camera, cam_from_tag: Pose, *, tag_id: int = 2, size_m: float = SIZE_M, family: str = "tag36h11",
     samples: int = 6, noise: float = 0.0, blur_px: float = 0.0, rng: np.random.Generator | None = None,
+    in_light: bool = False,
 ) -> Image:  # fmt: skip
-    """Render a tag by tracing samples^2 rays per pixel through the camera model, distortion included."""
-    texture = draw_tag(family, tag_id, cell_px=64)
-    half = size_m / 2 * len(texture) / (len(texture) - 128)
-    image = np.full((camera.height, camera.width), 170.0)
+    """Render a tag by tracing samples^2 rays per pixel through the camera model, distortion included.
+
+    Pixels average and blur grey values; ``in_light``, as in a camera, the light that sRGB's grey values stand for.
+    """
+    layout = FAMILIES[family]
+    border = max(1, (layout.total - layout.cells) // 2)
+    texture = draw_tag(family, tag_id, cell_px=64, border_cells=border)
+    half = size_m / 2 * len(texture) / (64 * layout.cells)
+    shades = np.array([20.0, 170.0, 230.0])
+    if in_light:
+        shades = to_light(shades)
+    image = np.full((camera.height, camera.width), shades[1])
     edge = cam_from_tag.apply(tag_corners(2 * half))
     pixels, _ = camera.project(edge)
     if np.isfinite(pixels).all():
         low = np.clip(np.floor(pixels.min(axis=0)) - 3, 0, (camera.width, camera.height)).astype(int)
         high = np.clip(np.ceil(pixels.max(axis=0)) + 3, 0, (camera.width, camera.height)).astype(int)
         if (high > low).all():
-            image[low[1] : high[1], low[0] : high[0]] = _trace(camera, cam_from_tag, texture, half, low, high, samples)
+            image[low[1] : high[1], low[0] : high[0]] = _trace(
+                camera, cam_from_tag, texture, half, low, high, samples, shades
+            )
     if blur_px:
         image = cv2.GaussianBlur(image, (0, 0), blur_px)
+    if in_light:
+        image = to_grey(image)
     if rng is not None:
         image = image + rng.normal(0.0, noise, image.shape)
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
 
-def _trace(camera: Camera, cam_from_tag: Pose, texture: Image, half: float, low, high, samples: int) -> Array:
+def _trace(camera: Camera, cam_from_tag: Pose, texture: Image, half: float, low, high, samples: int, shades) -> Array:
     columns, rows = ((np.arange((high[i] - low[i]) * samples) + 0.5) / samples + low[i] for i in (0, 1))
     x, y = np.meshgrid(columns, rows)
     rotation, origin = cam_from_tag.rotation.as_matrix(), cam_from_tag.inv().translation
@@ -51,8 +64,8 @@ def _trace(camera: Camera, cam_from_tag: Pose, texture: Image, half: float, low,
     on_tag = origin + rays * (-origin[2] / rays[:, 2])[:, None]
     u, v = ((1 + s * on_tag[:, i] / half) / 2 * len(texture) for i, s in ((0, 1), (1, -1)))
     inside = (u >= 0) & (u < len(texture)) & (v >= 0) & (v < len(texture)) & (rays[:, 2] * -origin[2] > 0)
-    values = np.full(len(u), 170.0)
-    values[inside] = 20 + texture[v[inside].astype(int), u[inside].astype(int)] / 255 * 210
+    values = np.full(len(u), shades[1])
+    values[inside] = np.where(texture[v[inside].astype(int), u[inside].astype(int)] > 0, shades[2], shades[0])
     return values.reshape(len(rows) // samples, samples, len(columns) // samples, samples).mean(axis=(1, 3))
 
 
@@ -145,3 +158,33 @@ def _odometry(drift: float, odom_from_map: Pose) -> Trajectory:
         stretched = Pose.from_components(moved.translation * (1 + drift), moved.rotation)
         poses.append(poses[-1] * stretched * exp([0, 0, drift * length, 0, 0, 0]))
     return Trajectory(times, tuple(poses), "odom", "body")
+
+
+def look_from(rng: np.random.Generator, direction: Array, distance_m: float, *, camera: Camera = VGA) -> Pose:
+    """Return cam_from_tag of a camera in a direction (3,) of the tag frame, at any roll, the tag whole in the image."""
+    centre = np.asarray(direction) / np.linalg.norm(direction) * distance_m
+    forward = -centre / distance_m
+    side = np.cross(forward, rng.normal(size=3))
+    side /= np.linalg.norm(side)
+    axes = np.column_stack([side, np.cross(forward, side), forward])
+    reach = np.array([camera.width, camera.height]) / 2 / camera.focal_px[0] - 0.7 * SIZE_M / distance_m - 0.05
+    aside = Rotation.from_rotvec([*(rng.uniform(-0.7, 0.7, 2) * np.maximum(reach, 0.0)), 0.0])
+    return Pose.from_components(centre, Rotation.from_matrix(axes) * aside).inv()
+
+
+def slanted(rng: np.random.Generator, slant_deg: tuple[float, float]) -> Array:
+    """Return a direction (3,) in the tag frame at an angle to the tag's normal."""
+    slant, around = math.radians(rng.uniform(*slant_deg)), rng.uniform(0, 2 * np.pi)
+    return np.array([np.sin(slant) * np.cos(around), np.sin(slant) * np.sin(around), np.cos(slant)])
+
+
+def to_light(grey: Array) -> Array:
+    """Return the light (0..1) of sRGB's grey values."""
+    v = np.asarray(grey, dtype=np.float64) / 255
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+
+
+def to_grey(light: Array) -> Array:
+    """Return sRGB's grey values of light (0..1)."""
+    bright = 1.055 * np.clip(light, 0.0031308, None) ** (1 / 2.4) - 0.055
+    return 255 * np.where(light <= 0.0031308, 12.92 * light, bright)

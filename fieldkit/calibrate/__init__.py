@@ -25,6 +25,7 @@ def calibrate_tags(
     camera: Path | None = None,
     sizes_m: Mapping[int | None, float],
     families: Sequence[str] = ("tag36h11",),
+    detector: str | None = None,
     rules: LocalizerRules | None = None,
     progress: Progress | None = None,
 ) -> TagMap:
@@ -34,7 +35,14 @@ def calibrate_tags(
     """
     scene_map = load_map(Path(map_path))
     return calibrate_photos(
-        photos, scene_map, camera=camera, sizes_m=sizes_m, families=families, rules=rules, progress=progress
+        photos,
+        scene_map,
+        camera=camera,
+        sizes_m=sizes_m,
+        families=families,
+        detector=detector,
+        rules=rules,
+        progress=progress,
     )
 
 
@@ -45,6 +53,7 @@ def calibrate_photos(
     camera: Path | None = None,
     sizes_m: Mapping[int | None, float],
     families: Sequence[str] = ("tag36h11",),
+    detector: str | None = None,
     rules: LocalizerRules | None = None,
     progress: Progress | None = None,
 ) -> TagMap:
@@ -62,7 +71,7 @@ def calibrate_photos(
     are rejected. Raises TagError, StoreError or LocalizeError.
     """
     listed = list_photos(Path(photos), camera)
-    shots, rejected = find_tags(Path(photos), listed, sizes_m, families, progress)
+    shots, rejected = find_tags(Path(photos), listed, sizes_m, families, progress, detector=detector)
     located, failed = locate(shots, scene_map, rules, progress)
     rejected += failed
     if not located:

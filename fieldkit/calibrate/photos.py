@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -11,22 +12,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fieldkit.calibrate import pictures
 from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
 from fieldkit.store import read_camera, read_photos
 from fieldkit.tags import TagDetection, detect
-from fieldkit.tags.drawing import family_cells
+from fieldkit.tags.detectors import find_detector
+from fieldkit.tags.families import FAMILIES
 from fieldkit.types import Image, TagPhoto
+
+log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
-# Cells of fewer pixels are mixed by the lens: their edges, and with them the corners, shift
+# Smaller tags show little of their tilt, and are taken for others more easily
 MIN_CELL_PX = 3.0
-# Cells across a tag of a family without a closed black square
-PLAIN_CELLS = 8
-# Edges are read half a cell to either side. In renders the corners err by more than three of their stated sigmas once
-# the blur exceeds this share of a cell: the neighbours come in
+# Blur of this share of a cell mixes it with its neighbours
 MAX_BLUR_CELLS = 0.3
 # Share of pixels that lie on steep edges: of a tag, of a whole photo
 TAG_EDGES, PHOTO_EDGES = 0.005, 0.0002
@@ -89,7 +90,7 @@ def list_photos(folder: Path, camera: Path | None) -> list[Photo]:
         cameras = {name: read_camera(path) for name, path in paths.items()}
         listed = [Photo(e.file, folder / e.file, cameras[e.camera], paths[e.camera], e.visit) for e in entries]
     else:
-        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES)
+        files = _photo_files(folder)
         path = camera or folder / "camera.toml"
         if files and not path.is_file():
             raise TagError(
@@ -104,7 +105,47 @@ def list_photos(folder: Path, camera: Path | None) -> list[Photo]:
         if not photo.path.is_file():
             raise TagError(f"{photo.path}: no such photo; expected it, since photos.toml lists it")
     _check_once(folder, listed)
+    _check_pictures(folder, listed)
     return listed
+
+
+def _photo_files(folder: Path) -> list[Path]:
+    """Return the photos of a folder that names none; raises TagError where all are of a format that is not read."""
+    every = sorted(p for p in folder.iterdir() if p.is_file())
+    files = [p for p in every if p.suffix.lower() in pictures.PHOTO_SUFFIXES]
+    converted = {p.stem for p in files}
+    foreign = [p for p in every if p.suffix.lower() in pictures.FOREIGN_SUFFIXES and p.stem not in converted]
+    if foreign and not files:
+        pictures.refuse_foreign(foreign[0])
+    if foreign:
+        log.warning(
+            "%s: %d files are left out, for example %s: only JPEG and PNG are read; %s",
+            folder, len(foreign), foreign[0].name, pictures.CONVERT_HINT,
+        )  # fmt: skip
+    return files
+
+
+def _check_pictures(folder: Path, listed: Sequence[Photo]) -> None:
+    """Refuse formats that are not read, photos of several cameras under one calibration, and other sizes; warn."""
+    by_camera: dict[Path, dict[str, pictures.PhotoHeader]] = {}
+    for photo in listed:
+        pictures.refuse_foreign(photo.path)
+        header = pictures.read_header(photo.path)
+        if header is not None:
+            by_camera.setdefault(photo.camera_path, {})[photo.file] = header
+    cameras = {p.camera_path: p.camera for p in listed}
+    for camera_path, headers in by_camera.items():
+        camera = cameras[camera_path]
+        pictures.refuse_mixture(headers, camera_path)
+        file, header = next(iter(headers.items()))
+        pictures.refuse_other_size(folder / file, header, (camera.width, camera.height), camera_path)
+        pictures.warn_focal(folder / file, header, float(np.mean(camera.focal_px)), camera_path)
+        deep = [f for f, h in headers.items() if h.bits > 8]
+        if deep:
+            log.warning(
+                "%s: %d photos have 16 bits per pixel, for example %s: read as 8 bits, the brightest as white",
+                folder, len(deep), deep[0],
+            )  # fmt: skip
 
 
 def _check_inside(folder: Path, names: Sequence[str]) -> None:
@@ -131,19 +172,12 @@ def _check_once(folder: Path, listed: Sequence[Photo]) -> None:
 
 
 def read_photo(photo: Photo) -> Image | None:
-    """Read a photo in grey, None where it is no image; raises TagError when it is not of its camera's size."""
-    # The sensor's pixels, as calibrated: a rotation noted in EXIF would swap the camera's axes
-    image = cv2.imread(str(photo.path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        return None
-    height, width = image.shape[:2]
-    if (width, height) != (photo.camera.width, photo.camera.height):
-        raise TagError(
-            f"{photo.path}: {width}x{height} pixels; expected {photo.camera.width}x{photo.camera.height} as in "
-            f"{photo.camera_path}",
-            hint="give the calibration of this camera at this resolution, not rotated or resized",
-        )
-    return np.asarray(image, dtype=np.uint8)
+    """Read a photo's stored pixels in grey, None where it is no image; raises TagError for another size."""
+    image = pictures.read_grey(photo.path)
+    if image is not None:
+        header = pictures.PhotoHeader(image.shape[1], image.shape[0])
+        pictures.refuse_other_size(photo.path, header, (photo.camera.width, photo.camera.height), photo.camera_path)
+    return image
 
 
 def find_tags(
@@ -152,8 +186,12 @@ def find_tags(
     sizes_m: Mapping[int | None, float],
     families: Sequence[str],
     progress: Progress | None,
+    *,
+    detector: str | None = None,
 ) -> tuple[list[Shot], list[TagPhoto]]:
     """Find the tags in photos; also return a verdict on each that cannot be used. Raises TagError when none can."""
+    for family in families:
+        find_detector(family, detector)
     shots: list[Shot] = []
     rejected: list[TagPhoto] = []
     seen: set[int] = set()
@@ -161,7 +199,7 @@ def find_tags(
         if progress is not None:
             progress("find tags", number + 1, len(listed))
         image = read_photo(photo)
-        found = [] if image is None else detect(image, photo.camera, families=families)
+        found = [] if image is None else detect(image, photo.camera, families=families, detector=detector)
         if not found:
             reason = "cannot be read as an image" if image is None else f"no tag found{describe_blur(image)}"
             rejected.append(TagPhoto(photo.file, -1, used=False, reason=reason, visit=photo.visit))
@@ -203,7 +241,11 @@ def _why_not(
         return "no size given for this tag"
     if [d.id for d in found].count(detection.id) > 1:
         return "the same id is seen twice in the photo"
-    cell_px = detection.edge_px / (family_cells(detection.family) or PLAIN_CELLS)
+    if (detection.corners_px < 0).any() or (detection.corners_px > image.shape[::-1]).any():
+        return "the tag is partly outside of the photo"
+    if detection.covariance_px is None:
+        return "its pattern cannot be fitted: the tag is partly outside of the photo, covered or bent"
+    cell_px = detection.edge_px / FAMILIES[detection.family].cells
     if cell_px < MIN_CELL_PX:
         edge = math.ceil(detection.edge_px * MIN_CELL_PX / cell_px)
         return f"the tag is too small: {detection.edge_px:.0f} px; expected an edge of at least {edge} px"

@@ -63,6 +63,7 @@ def check_in_second_map(
     camera: Path | None = None,
     sizes_m: Mapping[int | None, float],
     families: Sequence[str] = ("tag36h11",),
+    detector: str | None = None,
     progress: Progress | None = None,
 ) -> SecondLook:
     """Localize the photos of tags in two maps and compare their poses with their covariances.
@@ -72,7 +73,9 @@ def check_in_second_map(
     wrong, not that. Raises TagError where fewer than MIN_PHOTOS are localized in both; MapError, StoreError.
     """
     first, second = load_map(Path(map_path)), load_map(Path(second_path))
-    return look_again(photos, first, second, camera=camera, sizes_m=sizes_m, families=families, progress=progress)
+    return look_again(
+        photos, first, second, camera=camera, sizes_m=sizes_m, families=families, detector=detector, progress=progress
+    )
 
 
 def look_again(
@@ -83,6 +86,7 @@ def look_again(
     camera: Path | None = None,
     sizes_m: Mapping[int | None, float],
     families: Sequence[str] = ("tag36h11",),
+    detector: str | None = None,
     progress: Progress | None = None,
 ) -> SecondLook:
     """Localize photos in two maps and compare their poses; see `check_in_second_map`."""
@@ -90,7 +94,9 @@ def look_again(
         raise TagError(
             f"{second.path}: is the map that is checked; expected another", hint="build one with another --feature"
         )
-    shots, _ = find_tags(Path(photos), list_photos(Path(photos), camera), sizes_m, families, progress)
+    shots, _ = find_tags(
+        Path(photos), list_photos(Path(photos), camera), sizes_m, families, progress, detector=detector
+    )
     both = [locate(shots, scene_map, None, progress)[0] for scene_map in (first, second)]
     names = [{p.file for p in located} for located in both]
     shared = [p.file for p in both[0] if p.file in names[1]]

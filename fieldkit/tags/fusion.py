@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
 from fieldkit.frames import Pose, compose_covariance, exp
 from fieldkit.tags.detect import TagDetection
+from fieldkit.tags.lens import flat_covariance, flatten
 from fieldkit.tags.pose import TagSolution, project_derivative, solve, tag_corners, tilt_is_known
 
 Array = NDArray[np.float64]
@@ -21,6 +24,12 @@ Mask = NDArray[np.bool_]
 GATE = 40.0
 # Difference of two solutions' chi-square below which neither is certain: odds of e^10
 CERTAIN = 20.0
+# Sightings from directions that span less share what their corners are wrong by (lens, paper, light): they count as one
+SPAN_RAD = math.radians(15.0)
+# A candidate that is turned by less than this (rad) is no other solution
+SAME_RAD = 0.03
+# One sighting of a decided pose does not outweigh those that leave it open
+MOST_EVIDENCE = 2 * CERTAIN
 # What the stated noise of the cameras may be multiplied by
 SCALES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
@@ -43,8 +52,10 @@ class TagFix:
     ``used``, ``sigmas`` and ``ambiguities`` have one entry per sighting: whether it entered, its deviation from the
     result in standard deviations per degree of freedom, and its own ambiguity. ``flipped`` marks sightings whose own
     better solution is not the one that all together chose. ``scale`` multiplies the stated standard deviations of the
-    camera poses: their noise as the sightings show it. ``alternative`` is the other solution, when there is one,
-    ``ambiguity`` the ratio of the two residuals, and ``evidence`` the difference of their chi-squares.
+    camera poses: their noise as the sightings show it. ``span_rad`` is the largest angle between the directions from
+    which the tag is seen. ``alternative`` is the other solution, when there is one, ``ambiguity`` the ratio of the two
+    residuals, and ``evidence`` the difference of their chi-squares: of all sightings together where they span 15 deg,
+    else at most that of the average one by itself: from one direction they repeat an error of lens or paper.
     """
 
     ref_from_tag: Pose
@@ -59,11 +70,17 @@ class TagFix:
     alternative_covariance: Array | None = None
     ambiguity: float = 0.0
     evidence: float = float("inf")
+    span_rad: float = 0.0
 
     @property
     def is_certain(self) -> bool:
         """Whether the sightings decide between the two solutions, and these have not merged into one."""
-        return self.evidence > CERTAIN and tilt_is_known(self.covariance)
+        return self.evidence > CERTAIN and tilt_is_known(self.covariance * self.repeated)
+
+    @property
+    def repeated(self) -> int:
+        """How many sightings count as one: all that entered, where their directions span less than 15 deg."""
+        return 1 if self.span_rad >= SPAN_RAD else sum(self.used)
 
 
 def fuse_sightings(
@@ -117,18 +134,20 @@ def _fuse(
         tuple(s.ambiguity for s in solutions),
         tuple(_is_flipped(s, o, best) for s, o in zip(sightings, solutions, strict=True)),
         scale,
+        span_rad=_span(problem.directions(best)[used]),
     )
-    return _with_alternative(fix, problem, votes.others, used, factor)
+    fix = _with_alternative(fix, problem, votes.others, used, factor)
+    return fix if fix.span_rad >= SPAN_RAD else _as_one(fix, sightings, solutions)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    """Corners of n sightings as arrays: undistorted xy (n, 4, 2), focal, noise, cam_from_ref and its covariance."""
+    """Corners of n sightings as arrays: undistorted pixels (n, 4, 2), focal, their covariance, cam_from_ref and its."""
 
     points: Array
-    xy: Array
+    flat: Array
     focal: Array
-    sigma: Array
+    noise: Array
     rotation: Array
     translation: Array
     covariance: Array
@@ -138,9 +157,9 @@ class _Problem:
         cam_from_ref = [s.ref_from_cam.inv() for s in sightings]
         return _Problem(
             points,
-            np.stack([s.camera.unproject(s.detection.corners_px)[:, :2] for s in sightings]),
+            np.stack([flatten(s.camera, s.detection.corners_px) for s in sightings]),
             np.array([s.camera.focal_px for s in sightings]),
-            np.array([s.detection.sigma_px for s in sightings]),
+            np.stack([flat_covariance(s.camera, s.detection.corners_px, s.detection.noise_px) for s in sightings]),
             np.stack([p.rotation.as_matrix() for p in cam_from_ref]),
             np.stack([p.translation for p in cam_from_ref]),
             np.stack([s.covariance for s in sightings]),
@@ -148,7 +167,7 @@ class _Problem:
 
     def linearise(self, ref_from_tag: Pose) -> tuple[Array, Array, Array]:
         """Return residuals (n, 8) in pixels, their derivative by the tag (n, 8, 6) and by the cameras (n, 8, 6)."""
-        n = len(self.xy)
+        n = len(self.flat)
         rotation = ref_from_tag.rotation.as_matrix()
         x_in_ref = self.points @ rotation.T + ref_from_tag.translation
         x_in_cam = np.einsum("nij,kj->nki", self.rotation, x_in_ref) + self.translation[:, None]
@@ -166,13 +185,25 @@ class _Problem:
                 for x, z, f in zip(x_in_cam, in_front, self.focal, strict=True)
             ]
         )
-        residual = (self.xy * self.focal[:, None] - predicted).reshape(n, 8)
+        residual = (self.flat - predicted).reshape(n, 8)
         return residual, (slope @ by_tag).reshape(n, 8, 6), (slope @ by_cam).reshape(n, 8, 6)
+
+    def directions(self, ref_from_tag: Pose) -> Array:
+        """Return unit vectors (n, 3) in the tag frame from the tag to the cameras."""
+        cameras = -np.einsum("nji,nj->ni", self.rotation, self.translation)
+        rays = ref_from_tag.inv().apply(cameras)
+        result: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return result
+
+    def are_in_front(self, ref_from_tag: Pose, used: Mask) -> bool:
+        """Tell whether every corner lies in front of every camera that is used."""
+        x_in_ref = ref_from_tag.apply(self.points)
+        depth = np.einsum("nj,kj->nk", self.rotation[used, 2], x_in_ref) + self.translation[used, 2, None]
+        return bool((depth > 1e-3).all())
 
     def weights(self, by_cam: Array, scale: float) -> tuple[Array, Array]:
         """Return the inverse covariance (n, 8, 8) of each sighting's residuals and its log determinant (n,)."""
-        noise = self.sigma[:, None, None] ** 2 * np.eye(8)
-        total = noise + scale**2 * by_cam @ self.covariance @ by_cam.transpose(0, 2, 1)
+        total = self.noise + scale**2 * by_cam @ self.covariance @ by_cam.transpose(0, 2, 1)
         return np.asarray(np.linalg.inv(total)), np.asarray(np.linalg.slogdet(total)[1])
 
     def chi2(self, ref_from_tag: Pose, scale: float) -> Array:
@@ -196,10 +227,11 @@ class _Problem:
     def rms_px(self, ref_from_tag: Pose, used: Mask, scale: float) -> float:
         """Return the root mean square per coordinate of what remains in the corners, in pixels.
 
-        The cameras have moved within their noise to fit: of a residual r with covariance S, sigma^2 S^-1 r remains.
+        The cameras have moved within their noise to fit: of a residual r with covariance S, N S^-1 r remains, with the
+        corners' own covariance N.
         """
         residual, _, by_cam = self.linearise(ref_from_tag)
-        remains = self.sigma[:, None] ** 2 * np.einsum("nab,nb->na", self.weights(by_cam, scale)[0], residual)
+        remains = np.einsum("nab,nbc,nc->na", self.noise, self.weights(by_cam, scale)[0], residual)
         return float(np.sqrt(np.mean(remains[used] ** 2)))
 
     def minimise(self, start: Pose, used: Mask, scale: float) -> Pose:
@@ -301,13 +333,14 @@ def _settle(
 
 
 def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], used: Mask, factor: float) -> TagFix:
-    """Look for the other solution among the remaining candidates: another minimum of the same problem."""
+    """Look for the other solution, another minimum of the same problem: from the mirror image, then from candidates."""
     best = float(problem.chi2(fix.ref_from_tag, fix.scale)[used].sum())
-    for start in [p for p in others if (fix.ref_from_tag.inv() * p).rotation.magnitude() > 0.03][:4]:
-        other = problem.minimise(start, used, fix.scale)
-        if (fix.ref_from_tag.inv() * other).rotation.magnitude() < 0.02:
-            continue
-        cost = float(problem.chi2(other, fix.scale)[used].sum())
+    mirrored = _mirrored(fix.ref_from_tag, problem.directions(fix.ref_from_tag)[used].mean(axis=0))
+    starts = [p for p in (mirrored, *others) if _turned(fix.ref_from_tag, p) > SAME_RAD]
+    minima = [problem.minimise(start, used, fix.scale) for start in starts[:8]]
+    minima = [p for p in minima if _turned(fix.ref_from_tag, p) > 0.02 and problem.are_in_front(p, used)]
+    found = [(float(problem.chi2(p, fix.scale)[used].sum()), p) for p in minima]
+    for cost, other in sorted(found, key=lambda f: f[0]):
         try:
             covariance = _covariance(problem.information(other, used, fix.scale)) * factor
         except np.linalg.LinAlgError:
@@ -320,6 +353,65 @@ def _with_alternative(fix: TagFix, problem: _Problem, others: Sequence[Pose], us
             evidence=(cost - best) / factor,
         )
     return fix
+
+
+def _as_one(fix: TagFix, sightings: Sequence[Sighting], solutions: Sequence[TagSolution]) -> TagFix:
+    """Return a fix whose evidence is at most that of its average sighting by itself, with its other solution."""
+    own = [
+        (-1.0 if flipped else 1.0) * _evidence(s, o)
+        for s, o, flipped, used in zip(sightings, solutions, fix.flipped, fix.used, strict=True)
+        if used
+    ]
+    fix = dataclasses.replace(fix, evidence=min(fix.evidence, float(np.mean(np.minimum(own, MOST_EVIDENCE)))))
+    if fix.alternative is not None or fix.evidence > CERTAIN:
+        return fix
+    # Together they have no other minimum: that of the sighting that knows least
+    open_ones = [
+        (s, o) for s, o, u in zip(sightings, solutions, fix.used, strict=True) if u and o.alternative is not None
+    ]
+    if not open_ones:
+        return fix
+    sighting, solution = min(open_ones, key=lambda p: _evidence(*p))
+    options = [
+        (solution.cam_from_tag, solution.covariance),
+        (solution.alternative, solution.alternative_covariance),
+    ]
+    placed = [(sighting.ref_from_cam * p, p, c) for p, c in options if p is not None and c is not None]
+    other, cam_from_tag, covariance = max(placed, key=lambda p: _turned(fix.ref_from_tag, p[0]))
+    return dataclasses.replace(
+        fix,
+        alternative=other,
+        alternative_covariance=compose_covariance(sighting.covariance, cam_from_tag, covariance),
+        ambiguity=solution.ambiguity,
+    )
+
+
+def _evidence(sighting: Sighting, solution: TagSolution) -> float:
+    """Return the difference of chi-square of a sighting's own two solutions: none where they merged into one."""
+    if solution.alternative is None:
+        return math.inf if tilt_is_known(solution.covariance) else 0.0
+    better, other = (8 * (r / sighting.detection.sigma_px) ** 2 for r in (solution.rms_px, solution.alternative_rms_px))
+    # Two degrees of freedom remain to show that the corners are noisier than they say
+    return (other - better) / max(1.0, better / 2)
+
+
+def _turned(one: Pose, two: Pose) -> float:
+    return float((one.inv() * two).rotation.magnitude())
+
+
+def _mirrored(ref_from_tag: Pose, tag_to_camera: Array) -> Pose:
+    """Return the pose whose picture from a direction (3,) in the tag frame, without perspective, is the same.
+
+    Mirrored at the plane that faces the camera, and at its own: the sign of its slant cannot be told.
+    """
+    d = tag_to_camera / np.linalg.norm(tag_to_camera)
+    turn = (np.eye(3) - 2 * np.outer(d, d)) @ np.diag([1.0, 1.0, -1.0])
+    return Pose.from_components(ref_from_tag.translation, ref_from_tag.rotation * Rotation.from_matrix(turn))
+
+
+def _span(directions: Array) -> float:
+    """Return the largest angle in rad between unit vectors (n, 3)."""
+    return float(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0)))
 
 
 def _covariance(information: Array) -> Array:

@@ -13,6 +13,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
 from fieldkit.frames import Pose, exp, pose_from_matrix, skew
 from fieldkit.tags.detect import TagDetection
+from fieldkit.tags.lens import flat_covariance, flatten
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,8 @@ class TagSolution:
 
     ``ambiguity`` is the residual of the better solution over that of the other one, 0..1: above 0.2 the choice is
     suspect, at 1 the image cannot tell them apart. Without another solution it is 0, or 1 where the tilt is so
-    uncertain that both have merged. Residuals are root mean squares per coordinate, in pixels.
+    uncertain that both have merged. Residuals are root mean squares per coordinate, in pixels, weighted by the corners'
+    covariance: the chi-square of a solution is 8 (rms_px / sigma_px)^2.
     """
 
     cam_from_tag: Pose
@@ -49,33 +51,36 @@ def tag_corners(size_m: float) -> Array:
 def solve(detection: TagDetection, camera: Camera, size_m: float) -> TagSolution:
     """Solve cam_from_tag from the corners: IPPE (Collins and Bartoli 2014), both solutions refined by least squares.
 
-    The residuals are differences of undistorted corners in pixels. The covariance (right perturbation) is that of
-    the corners' noise ``detection.sigma_px``; the errors of the calibration and of ``size_m`` are not in it.
+    The residuals are differences of undistorted corners, weighted by their covariance ``detection.noise_px``. The
+    covariance (right perturbation) is what this gives; errors of the calibration and of ``size_m`` are not in it.
     Raises TagError when no solution lies in front of the camera.
     """
-    xy = camera.unproject(detection.corners_px)[:, :2]
+    flat = flatten(camera, detection.corners_px)
     points = tag_corners(size_m)
     focal = np.asarray(camera.focal_px)
+    noise = flat_covariance(camera, detection.corners_px, detection.noise_px)
+    whitening = np.linalg.inv(np.linalg.cholesky(noise))
     found = []
-    for start in _planar(xy, points):
-        cam_from_tag, residual, jacobian = _refine(start, xy, points, focal)
+    for start in _planar(flat / focal, points):
+        cam_from_tag, residual, jacobian = _refine(start, flat, points, focal, whitening)
         if (cam_from_tag.apply(points)[:, 2] > 0).all():
-            found.append((float(np.sqrt(np.mean(residual**2))), cam_from_tag, jacobian))
+            rms = detection.sigma_px * float(np.sqrt(np.mean(residual**2)))
+            found.append((rms, cam_from_tag, jacobian))
     found.sort(key=lambda f: f[0])
     if not found:
         raise TagError(f"tag {detection.id}: its corners fit no pose in front of the camera; expected a convex square")
     rms, best, jacobian = found[0]
     others = [f for f in found[1:] if (best.inv() * f[1]).rotation.magnitude() > 1e-3]
     if not others:
-        covariance = _covariance(jacobian, detection.sigma_px)
+        covariance = _covariance(jacobian)
         return TagSolution(best, covariance, rms, None, None, float("inf"), 0.0 if tilt_is_known(covariance) else 1.0)
     other_rms, other, other_jacobian = others[0]
     return TagSolution(
         best,
-        _covariance(jacobian, detection.sigma_px),
+        _covariance(jacobian),
         rms,
         other,
-        _covariance(other_jacobian, detection.sigma_px),
+        _covariance(other_jacobian),
         other_rms,
         rms / max(other_rms, 1e-12),
     )
@@ -125,21 +130,21 @@ def _planar(xy: Array, points: Array) -> list[Pose]:
     return poses
 
 
-def _refine(start: Pose, xy: Array, points: Array, focal: Array) -> tuple[Pose, Array, Array]:
-    """Minimise the pixel residuals by Levenberg-Marquardt; return pose, residuals (8,) and Jacobian (8, 6)."""
+def _refine(start: Pose, flat: Array, points: Array, focal: Array, whitening: Array) -> tuple[Pose, Array, Array]:
+    """Minimise the whitened residuals by Levenberg-Marquardt; return pose, residuals (8,) and Jacobian (8, 6)."""
     cam_from_tag, damping = start, 1e-6
     unit = np.repeat([1.0, float(np.linalg.norm(start.translation))], 3)
     predicted, derivative = project_tag(cam_from_tag, points, focal)
-    residual, jacobian = (xy * focal - predicted).ravel(), derivative.reshape(-1, 6)
+    residual, jacobian = whitening @ (flat - predicted).ravel(), whitening @ derivative.reshape(-1, 6)
     for _ in range(30):
         normal = jacobian.T @ jacobian
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residual)
         candidate = cam_from_tag * exp(step)
         predicted, derivative = project_tag(candidate, points, focal)
-        new = (xy * focal - predicted).ravel()
+        new = whitening @ (flat - predicted).ravel()
         if new @ new < residual @ residual:
             gain = residual @ residual - new @ new
-            cam_from_tag, residual, jacobian = candidate, new, derivative.reshape(-1, 6)
+            cam_from_tag, residual, jacobian = candidate, new, whitening @ derivative.reshape(-1, 6)
             damping = max(damping / 10, 1e-12)
             if gain < 1e-14:
                 break
@@ -150,6 +155,6 @@ def _refine(start: Pose, xy: Array, points: Array, focal: Array) -> tuple[Pose, 
     return cam_from_tag, residual, jacobian
 
 
-def _covariance(jacobian: Array, sigma_px: float) -> Array:
-    covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian) * sigma_px**2, dtype=np.float64)
+def _covariance(jacobian: Array) -> Array:
+    covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
     return (covariance + covariance.T) / 2

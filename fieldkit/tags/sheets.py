@@ -55,8 +55,9 @@ class _Page:
 def write_sheets(path: Path, ids: Sequence[int], *, size_m: float, family: str, paper: str) -> None:
     """Write a PDF with one tag per page, at true scale; ``size_m`` is the edge length of the black square.
 
-    Raises TagError for an unknown family or paper, an id that the family does not have or that is given twice, a
-    size that is no length, and a tag that does not fit the paper with its quiet margin, ruler and text.
+    Raises TagError for a family without a closed black square, an unknown paper, an id that the family does not have or
+    that is given twice, a size that is no length, and a tag that does not fit the paper with its quiet margin, ruler
+    and text.
     """
     if paper not in PAPERS:
         raise TagError(f"unknown paper {paper!r}", hint=suggestion(paper, list(PAPERS)))
@@ -65,6 +66,8 @@ def write_sheets(path: Path, ids: Sequence[int], *, size_m: float, family: str, 
     twice = [str(i) for i, n in Counter(ids).items() if n > 1]
     if twice:
         raise TagError(f"tag {', '.join(twice)} is given twice; expected every id once", hint="correct --ids")
+    if family not in DRAWN_FAMILIES:
+        raise TagError(f"cannot draw tag family {family!r} on a sheet", hint=suggestion(family, list(DRAWN_FAMILIES)))
     drawn = [draw_tag(family, tag_id, cell_px=1, border_cells=0) == 0 for tag_id in ids]
     page = _layout(size_m, family=family, paper=paper)
     buffer = io.BytesIO()
@@ -85,7 +88,7 @@ def write_sheets(path: Path, ids: Sequence[int], *, size_m: float, family: str, 
 
 
 def _layout(size_m: float, *, family: str, paper: str) -> _Page:
-    cells = DRAWN_FAMILIES[family][1]
+    cells = DRAWN_FAMILIES[family]
     edge = 1e3 * size_m
     if not math.isfinite(edge) or edge < SMALLEST_CELL_MM * cells:
         raise TagError(
@@ -110,7 +113,7 @@ def largest_mm(family: str, paper: str) -> float:
     """Return the edge length in mm of the largest tag of a family that fits a paper."""
     width, height = PAPERS[paper]
     room = min(width - 2 * MARGIN_MM, height - HEADER_MM - FOOTER_MM)
-    return room / (1 + 2 * QUIET_CELLS / DRAWN_FAMILIES[family][1])
+    return room / (1 + 2 * QUIET_CELLS / DRAWN_FAMILIES[family])
 
 
 def _length(value_mm: float) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fieldkit.errors import TagError, suggestion
 from fieldkit.store.files import atomic_write, digest
-from fieldkit.tags.detect import FAMILIES
+from fieldkit.tags.families import FAMILIES
 from fieldkit.tags.formats import apriltag_ros, spot, tagslam
 from fieldkit.tags.formats.common import Exported, Imported, ImportOptions
 from fieldkit.types import TagMap
@@ -38,7 +38,7 @@ def import_tags(path: Path, format: str, *, options: ImportOptions | None = None
     """
     chosen = options or ImportOptions()
     if chosen.family not in FAMILIES:
-        raise TagError(f"unknown tag family {chosen.family!r}", hint=suggestion(chosen.family, FAMILIES))
+        raise TagError(f"unknown tag family {chosen.family!r}", hint=suggestion(chosen.family, list(FAMILIES)))
     found = _format(format).read(Path(path), chosen)
     return dataclasses.replace(found, tags=dataclasses.replace(found.tags, digest=digest(Path(path))))
 
