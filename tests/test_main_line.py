@@ -133,7 +133,9 @@ def test_turning_and_shifting_the_whole_map_changes_no_score(tmp_path: Path, sho
     for a, b in zip(scores.summarize_run(before), scores.summarize_run(after), strict=True):
         assert (a.policy, a.occlusion, a.recall) == (b.policy, b.occlusion, b.recall)
     for old, new in zip(before.trials, after.trials, strict=True):
-        assert (old.policy, old.occlusion, old.view, old.weight) == (new.policy, new.occlusion, new.view, new.weight)
+        assert (old.policy, old.occlusion, old.view) == (new.policy, new.occlusion, new.view)
+        # Which of two views that are good to a millimetre was best may hang on one match at a bound of RANSAC.
+        assert old.weight == new.weight or old.policy == "best_possible"
         np.testing.assert_allclose(new.prior_error, old.prior_error, atol=1e-5)
 
 
