@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ from synthetic_map import CAMERA, looking
 
 from fieldkit.features import Features
 from fieldkit.frames import Pose, exp
+from fieldkit.maps.build import MapOptions, _Matched, _place, _unfolded
 from fieldkit.maps.plausible import SlamRules, plausible_pairs
 from fieldkit.maps.sfm import relative_poses
-from fieldkit.maps.source import SourceImage
+from fieldkit.maps.source import MapSource, SourceImage
 from fieldkit.maps.strays import contradicting
 
 PLACES = [looking(np.array([x, 0.0, 1.5]), np.pi / 2) for x in (0.0, 1.0)]
@@ -68,3 +70,38 @@ def test_an_image_contradicts_where_it_is_farther_from_slam_than_drift_goes() ->
     mapped = {0: PLACES[0], 1: ELSEWHERE, 2: ELSEWHERE}
     assert contradicting(images, mapped, threshold_m=0.05) == {1}
     assert contradicting(images, mapped, threshold_m=1.1) == set()
+
+
+def two_rooms(rng: np.random.Generator) -> _Matched:
+    """Return a walk past two identical rooms 6 m apart with little between them, with the matches of both kinds."""
+    room = rng.uniform([-0.8, 2.2, 0.6], [0.8, 3.4, 2.4], (150, 3))
+    wall = rng.uniform([0.5, 2.6, 0.6], [5.5, 3.2, 2.4], (70, 3))
+    points = np.vstack([room, room + [6.0, 0.0, 0.0], wall])
+    images, seen, ids = [], [], []
+    for k, x in enumerate(np.arange(-0.6, 6.7, 0.3)):
+        place = looking(np.array([x, 0.03 * rng.normal(), 1.5 + 0.03 * rng.normal()]), np.pi / 2)
+        pixels, inside = CAMERA.project(place.inv().apply(points))
+        visible = np.flatnonzero(inside & ((pixels > 0) & (pixels < (CAMERA.width, CAMERA.height))).all(axis=1))
+        pixels = pixels[visible] + rng.normal(0.0, 0.3, (len(visible), 2))
+        unused = np.zeros(len(visible), np.float32)
+        seen.append(Features(pixels.astype(np.float32), unused, unused, np.zeros((len(visible), 128), np.float32)))
+        images.append(SourceImage(f"{k:03d}.jpg", Path(), CAMERA, "", f"{k:03d}", place))
+        ids.append(visible)
+    pairs, matches = [], []
+    for a, b in itertools.combinations(range(len(images)), 2):
+        # Far apart along the walk a point's twin in the other room is taken for it; neighbours see the point itself.
+        twin = 12 < b - a < 20
+        other = {int(i) - 150 * (twin and 150 <= i < 300): n for n, i in enumerate(ids[b]) if not twin or i < 300}
+        common = [(n, other[int(i)]) for n, i in enumerate(ids[a]) if int(i) in other and (twin or b - a < 5)]
+        pairs.append((a, b))
+        matches.append(np.array(common, np.uint32).reshape(-1, 2))
+    return _Matched(MapSource(Path("two rooms"), tuple(images), None, ()), seen, pairs, matches)
+
+
+def test_a_map_in_which_one_room_lies_on_the_next_is_unfolded(rng: np.random.Generator) -> None:
+    found, options = two_rooms(rng), MapOptions(n_threads=1)
+    folded = _place(found, options, 0, lambda step, done, total: None)
+    assert folded.contradicting > 0.05 * len(folded.sfm_poses)
+    again = _place(_unfolded(found, SlamRules(), options, 0), options, 0, lambda step, done, total: None)
+    assert again.contradicting == 0
+    assert len(again.sfm_poses) == len(found.walk.images)

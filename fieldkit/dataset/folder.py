@@ -38,6 +38,7 @@ _LEFT = r"\.({})\.[a-z0-9_]{{8}}"
 def own(out: Path) -> Iterator[None]:
     """Hold the folder alone: two runs at once would do the same work twice. What was not there and stays empty goes."""
     if not is_dataset(out) and not _holds_only_maps(out):
+        # A folder of something else: no --force replaces it, so none is asked for.
         refuse_existing(out, force=True, marker=DATASET_FILE, kind="folder")
     new = not out.exists()
     with _locked(out):

@@ -84,9 +84,12 @@ def plausible_pairs(
         b_from_a = second.inv() * first
         turned = (found.rotation * b_from_a.rotation.inv()).magnitude()
         result[k] = turned <= np.radians(rules.pair_rotation_deg)
-        if np.linalg.norm(b_from_a.translation) > rules.pair_baseline_m:
-            cosine = float(_unit(found.translation[None])[0] @ _unit(b_from_a.translation[None])[0])
-            result[k] &= cosine >= np.cos(np.radians(rules.pair_direction_deg))
+        baseline_m = float(np.linalg.norm(b_from_a.translation))
+        if baseline_m > rules.pair_baseline_m:
+            # Images from one spot have a length of 0, and so no direction: SLAM has one.
+            along = float(found.translation @ b_from_a.translation)
+            least = baseline_m * float(np.linalg.norm(found.translation)) * np.cos(np.radians(rules.pair_direction_deg))
+            result[k] &= along > 0 and along >= least
     return result
 
 
