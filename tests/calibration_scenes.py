@@ -36,11 +36,7 @@ class Scene:
     def joint(self) -> tuple[Landmarks, Corners, State]:
         """Return the joint problem of all photos and tags, and the true state."""
         landmarks = Landmarks.of([(p.landmark, p.bearings) for p in self.photos], self.xyz, self.covariance)
-        sightings = [
-            (i, d.id, bearings(p.camera, d.corners_px, d.sigma_px))
-            for i, p in enumerate(self.photos)
-            for d in p.detections
-        ]
+        sightings = [(i, d.id, p.camera, d) for i, p in enumerate(self.photos) for d in p.detections]
         sizes = np.full(len(self.map_from_tags), SIZE_M)
         state = State(Poses.of(self.map_from_cams), Poses.of(self.map_from_tags), sizes)
         return landmarks, Corners.of(sightings), state
@@ -70,10 +66,12 @@ def photograph(
     shared: bool = True,
     tags: tuple[Pose, ...] = (MAP_FROM_TAG,),
     warp_m: float = 0.0,
+    corner_px: float = CORNER_PX,
 ) -> Scene:
     """Photograph tags: every photo sees ``n_landmarks``, from a cloud of three times as many where they are shared.
 
-    ``warp_m`` displaces all landmarks of a photo together, which the map's covariance does not tell.
+    ``warp_m`` displaces all landmarks of a photo together, which the map's covariance does not tell. Corners have
+    noise of ``corner_px`` (root mean square), correlated.
     """
     cams = tuple(aim(rng) for _ in range(n_photos))
     count = 3 * n_landmarks if shared else n_landmarks * n_photos
@@ -87,7 +85,16 @@ def photograph(
         rows = np.arange(count) if shared else np.arange(i * n_landmarks, (i + 1) * n_landmarks)
         seen = cloud + rng.normal(0, warp_m, 3) if warp_m else cloud
         photos.append(
-            _photo(rng, f"{i}.jpg", map_from_cam, seen, rows, n_landmarks, tuple(map_from_cam.inv() * t for t in tags))
+            _photo(
+                rng,
+                f"{i}.jpg",
+                map_from_cam,
+                seen,
+                rows,
+                n_landmarks,
+                tuple(map_from_cam.inv() * t for t in tags),
+                corner_px,
+            )
         )
     return Scene(tags, cams, cloud, xyz, covariance, tuple(photos))
 
@@ -100,6 +107,7 @@ def _photo(
     rows: Array,
     n_landmarks: int,
     cam_from_tags: tuple[Pose, ...],
+    corner_px: float,
 ) -> LocatedPhoto:
     pixels, visible = PHOTO.project(map_from_cam.inv().apply(cloud[rows]))
     chosen = rng.permutation(np.flatnonzero(visible))[:n_landmarks]
@@ -107,11 +115,24 @@ def _photo(
     detections = []
     for tag_id, cam_from_tag in enumerate(cam_from_tags):
         corners = PHOTO.project(cam_from_tag.apply(tag_corners(SIZE_M)))[0]
-        detections.append(TagDetection(tag_id, "tag36h11", corners + rng.normal(0, CORNER_PX, (4, 2)), CORNER_PX))
+        noise = corner_noise(rng, corner_px)
+        detections.append(TagDetection(tag_id, "tag36h11", drawn(rng, corners, noise), corner_px, noise))
     start = map_from_cam * exp(rng.normal(0, [0.002] * 3 + [0.005] * 3))
     return LocatedPhoto(
         file, None, PHOTO, start, np.zeros((6, 6)), rows[chosen], bearings(PHOTO, noisy, 1.0), tuple(detections)
     )
+
+
+def corner_noise(rng: np.random.Generator, corner_px: float) -> Array:
+    """Draw a covariance f64[8, 8] of corners: of ``corner_px`` (root mean square), unequal and correlated."""
+    root = np.eye(8) + rng.normal(0, 0.2, (8, 8))
+    covariance = root @ root.T
+    return np.asarray(covariance * (8 * corner_px**2 / np.trace(covariance)))
+
+
+def drawn(rng: np.random.Generator, corners: Array, noise: Array) -> Array:
+    """Return corners (4, 2) with noise of covariance (8, 8)."""
+    return corners + rng.multivariate_normal(np.zeros(8), noise, method="cholesky").reshape(4, 2)
 
 
 def localize_wrongly(rng: np.random.Generator, scene: Scene, index: int, *, distance_m: float) -> LocatedPhoto:
@@ -138,7 +159,7 @@ def flip(rng: np.random.Generator, scene: Scene, index: int) -> LocatedPhoto:
     angle = math.atan2(float(np.linalg.norm(axis)), float(normal @ mirrored))
     turn = Rotation.from_rotvec(axis / max(float(np.linalg.norm(axis)), 1e-12) * angle)
     other = Pose.from_components(cam_from_tag.translation, turn * cam_from_tag.rotation)
-    corners = PHOTO.project(other.apply(tag_corners(SIZE_M)))[0] + rng.normal(0, CORNER_PX, (4, 2))
+    corners = drawn(rng, PHOTO.project(other.apply(tag_corners(SIZE_M)))[0], photo.detections[0].noise_px)
     flipped = dataclasses.replace(photo.detections[0], corners_px=corners)
     return dataclasses.replace(photo, detections=(flipped, *photo.detections[1:]))
 

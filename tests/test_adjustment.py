@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from calibration_scenes import MAP_FROM_TAG, PHOTO, SIZE_M, Scene, photograph
+from calibration_scenes import MAP_FROM_TAG, PHOTO, SIZE_M, Scene, corner_noise, drawn, photograph
 
 from fieldkit.calibrate.adjustment import Corners, Landmarks, State, adjust, adjust_cameras
-from fieldkit.calibrate.geometry import Poses, bearings
+from fieldkit.calibrate.geometry import Poses, bearings, corner_bearings
 from fieldkit.calibrate.solving import SolvedTag, solve_tags
 from fieldkit.frames import Array, Pose, exp, log, pose_error
 
@@ -36,6 +36,17 @@ def test_whitening_is_the_distorted_pixel_in_sigmas() -> None:
     one, two = bearings(PHOTO, pixels, 0.5), bearings(PHOTO, pixels + shift, 0.5)
     whitened = np.einsum("nij,nj->ni", one.whitening, two.xy - one.xy)
     np.testing.assert_allclose(whitened, np.tile(shift / 0.5, (3, 1)), atol=1e-5)
+
+
+def test_corners_are_whitened_by_their_covariance(rng: np.random.Generator) -> None:
+    pixels, shift = (
+        np.array([[30.0, 50.0], [800.0, 600.0], [1500.0, 100.0], [700.0, 90.0]]),
+        rng.normal(0, 0.01, (4, 2)),
+    )
+    noise = corner_noise(rng, 0.4)
+    (one, whitening), (two, _) = (corner_bearings(PHOTO, p, noise) for p in (pixels, pixels + shift))
+    whitened = whitening @ (two - one).ravel()
+    assert whitened @ whitened == pytest.approx(shift.ravel() @ np.linalg.solve(noise, shift.ravel()), rel=1e-3)
 
 
 def test_derivatives_of_corners_are_the_numeric_ones() -> None:
@@ -148,10 +159,10 @@ def _noisy(rng: np.random.Generator, scene: Scene, exact: tuple[list[Array], lis
         (photo.landmark, bearings(PHOTO, px + rng.normal(0, 1.0, px.shape), 1.0))
         for photo, px in zip(scene.photos, exact[0], strict=True)
     ]
-    n_tags = len(scene.map_from_tags)
+    detections = [(i, d) for i, photo in enumerate(scene.photos) for d in photo.detections]
     corners = [
-        (i // n_tags, i % n_tags, bearings(PHOTO, px + rng.normal(0, 0.4, px.shape), 0.4))
-        for i, px in enumerate(exact[1])
+        (i, d.id, PHOTO, dataclasses.replace(d, corners_px=drawn(rng, px, d.noise_px)))
+        for (i, d), px in zip(detections, exact[1], strict=True)
     ]
     return Landmarks.of(seen, xyz, scene.covariance), Corners.of(corners)
 

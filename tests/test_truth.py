@@ -133,7 +133,7 @@ def test_a_wrong_tag_size_is_no_truth(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(
     ("size_m", "message"),
-    [(1e-6, "the 5 sightings of tag 2 (determine no pose|disagree with kinematics)"), (1e-160, "its corners fit no pose")],
+    [(1e-6, "5 sightings of tag 2 (determine no pose|disagree with kinematics)"), (1e-160, "its corners fit no pose")],
 )
 def test_sightings_without_a_solution_are_named(rng: np.random.Generator, size_m: float, message: str) -> None:
     robot = stand_and_look(rng=rng)

@@ -17,9 +17,10 @@ import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
-from fieldkit.calibrate.geometry import Bearings, Poses, project, skews
+from fieldkit.calibrate.geometry import Bearings, Poses, corner_bearings, project, skews
+from fieldkit.cameras import Camera
 from fieldkit.frames import Array
-from fieldkit.tags import tag_corners
+from fieldkit.tags import TagDetection, tag_corners
 
 Mask = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -160,19 +161,26 @@ class FixedLandmarks:
 
 @dataclasses.dataclass(frozen=True)
 class Corners:
-    """Sightings (c) of tags (t): photo and tag of each, and bearings of its corners (c, 4)."""
+    """Sightings (c) of tags (t): photo and tag of each, and where its corners are seen.
+
+    ``xy`` f64[c, 4, 2] at depth 1, and ``whitening`` f64[c, 8, 8] that turns small differences of them into standard
+    deviations of the corners' noise.
+    """
 
     photo: Ints
     tag: Ints
-    bearings: Bearings
+    xy: Array
+    whitening: Array
 
     @staticmethod
-    def of(sightings: Sequence[tuple[int, int, Bearings]]) -> Corners:
-        """Stack sightings, each with its photo, its tag and the bearings (4) of its corners."""
+    def of(sightings: Sequence[tuple[int, int, Camera, TagDetection]]) -> Corners:
+        """Stack sightings, each with its photo, its tag, the camera and the detection."""
+        seen = [corner_bearings(camera, d.corners_px, d.noise_px) for _, _, camera, d in sightings]
         return Corners(
-            np.array([p for p, _, _ in sightings], dtype=np.int64),
-            np.array([t for _, t, _ in sightings], dtype=np.int64),
-            Bearings(np.stack([b.xy for _, _, b in sightings]), np.stack([b.whitening for _, _, b in sightings])),
+            np.array([p for p, _, _, _ in sightings], dtype=np.int64),
+            np.array([t for _, t, _, _ in sightings], dtype=np.int64),
+            np.stack([xy for xy, _ in seen]),
+            np.stack([whitening for _, whitening in seen]),
         )
 
     def __len__(self) -> int:
@@ -192,13 +200,18 @@ class Corners:
         turn = -(cam_from_tag @ skews(points.reshape(-1, 3)).reshape(c, 4, 3, 3))
         by_tag = slope @ np.concatenate([turn, np.broadcast_to(cam_from_tag, turn.shape)], axis=3)
         by_size = slope @ (cam_from_tag @ points[..., None])
+        own = self.whitening @ np.concatenate([by_camera, by_tag, by_size], axis=3).reshape(c, 8, 13)
         result = np.zeros((c, 8, 6 * n_photos + 7 * n_tags))
         for i, (photo, tag) in enumerate(zip(self.photo, self.tag, strict=True)):
-            result[i, :, 6 * photo : 6 * photo + 6] = by_camera[i].reshape(8, 6)
+            result[i, :, 6 * photo : 6 * photo + 6] = own[i, :, :6]
             first = 6 * (n_photos + tag)
-            result[i, :, first : first + 6] = by_tag[i].reshape(8, 6)
-            result[i, :, 6 * (n_photos + n_tags) + tag] = by_size[i].reshape(8)
+            result[i, :, first : first + 6] = own[i, :, 6:12]
+            result[i, :, 6 * (n_photos + n_tags) + tag] = own[i, :, 12]
         return residual, result
+
+    def chosen(self, rows: Mask, photo: Ints) -> Corners:
+        """Return some of the sightings (bool[c]), their photos renumbered to ``photo``."""
+        return Corners(photo, self.tag[rows], self.xy[rows], self.whitening[rows])
 
     def _points(self, state: State) -> Array:
         return tag_corners(1.0) * state.sizes_m[self.tag][:, None, None]
@@ -210,9 +223,8 @@ class Corners:
         x_in_map = np.einsum("cij,ckj->cki", tag_rotation, self._points(state)) + tag_position[:, None]
         x_in_cam = np.einsum("cij,ckj->cki", cam_from_map, x_in_map - state.cameras.position[self.photo][:, None])
         xy, slope = project(x_in_cam.reshape(-1, 3))
-        slope = self.bearings.whitening @ slope.reshape(c, 4, 2, 3)
-        residual = np.einsum("ckij,ckj->cki", self.bearings.whitening, self.bearings.xy - xy.reshape(c, 4, 2))
-        return residual.reshape(c, 8), slope, x_in_cam, cam_from_map
+        residual = np.einsum("cij,cj->ci", self.whitening, (self.xy - xy.reshape(c, 4, 2)).reshape(c, 8))
+        return residual, slope.reshape(c, 4, 2, 3), x_in_cam, cam_from_map
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
@@ -75,12 +76,25 @@ class Bearings:
 
 def bearings(camera: Camera, pixels: ArrayLike, sigma_px: float) -> Bearings:
     """Return pixels (n, 2) of a camera, with ``sigma_px`` of noise per axis in the distorted image, as Bearings."""
+    xy, slope = _unbent(camera, pixels)
+    return Bearings(xy, slope / sigma_px)
+
+
+def corner_bearings(camera: Camera, corners_px: Array, noise_px: Array) -> tuple[Array, Array]:
+    """Return corners (4, 2) of a tag as bearings (4, 2), and the whitening f64[8, 8] of their covariance (8, 8)."""
+    xy, slope = _unbent(camera, corners_px)
+    whitening = np.linalg.inv(np.linalg.cholesky(noise_px))
+    return xy, np.asarray(whitening @ scipy.linalg.block_diag(*slope), dtype=np.float64)
+
+
+def _unbent(camera: Camera, pixels: ArrayLike) -> tuple[Array, Array]:
+    """Return pixels (n, 2) as bearings xy (n, 2), and the derivative (n, 2, 2) of pixels by xy."""
     xy, step = camera.unproject(pixels)[:, :2], 1e-6
     columns = [
         (camera.distort(xy + shift) - camera.distort(xy - shift)) / (2 * step) * camera.focal_px
         for shift in ((step, 0.0), (0.0, step))
     ]
-    return Bearings(xy, np.stack(columns, axis=2) / sigma_px)
+    return xy, np.stack(columns, axis=2)
 
 
 def skews(v: Array) -> Array:

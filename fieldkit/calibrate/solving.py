@@ -19,7 +19,7 @@ from fieldkit.calibrate.adjustment import (
     adjust_cameras,
 )
 from fieldkit.calibrate.agreement import Agreement, agree, settle, without
-from fieldkit.calibrate.geometry import Poses, bearings
+from fieldkit.calibrate.geometry import Poses
 from fieldkit.calibrate.locating import LocatedPhoto
 from fieldkit.calibrate.starting import Group, Homeless, Sighted, group, sight
 from fieldkit.errors import TagError
@@ -156,12 +156,9 @@ def place_photos(photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array) 
 
 
 def _corners(groups: Sequence[Group]) -> Corners:
-    sightings = []
-    for t, g in enumerate(groups):
-        for s in g.members:
-            d = s.sighting.detection
-            sightings.append((s.photo, t, bearings(s.sighting.camera, d.corners_px, d.sigma_px)))
-    return Corners.of(sightings)
+    return Corners.of(
+        [(s.photo, t, s.sighting.camera, s.sighting.detection) for t, g in enumerate(groups) for s in g.members]
+    )
 
 
 def _settle(
@@ -170,7 +167,7 @@ def _settle(
     """Solve with the photos that agree alone; also return their sightings, and which (c) of all these are."""
     every, state = problem.corners, agreed.adjusted.state
     rows: Mask = np.isin(every.photo, kept)
-    corners = Corners(np.searchsorted(kept, every.photo[rows]), every.tag[rows], every.bearings[rows])
+    corners = every.chosen(rows, np.searchsorted(kept, every.photo[rows]))
     final = settle(
         alone,
         corners,
@@ -234,7 +231,7 @@ def _sightings(
                 bool(used[c]),
                 float(sigmas[c]),
                 pose_error(sighted.sighting.ref_from_cam * sighted.solution.cam_from_tag, map_from_tag),
-                residual[c] * sighted.sighting.detection.sigma_px,
+                np.linalg.cholesky(sighted.sighting.detection.noise_px) @ residual[c],
                 _is_flipped(sighted, map_from_tag, None if used[c] else covariance),
                 None if np.isnan(moved[c, 0]) else (float(moved[c, 0]), float(moved[c, 1])),
                 int(others.sum()) > int(not used[c]) and not bool(used[others].any()),
