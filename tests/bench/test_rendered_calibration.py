@@ -1,0 +1,239 @@
+"""How accurate tag calibration is through rendered photos, maps built from images, and localization: `make bench`.
+
+Four sessions of the demo's room with five tags each, every tag in 8 photos of 12 megapixels; each session has its own
+map, built from its own mapping walk. Truth is that of the renderer, after one rigid fit of the map to the mapping
+cameras, as in `fieldkit judge`. Nothing here passes or fails.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from fieldkit.calibrate import calibrate_tags
+from fieldkit.calibrate.adjustment import Corners, Landmarks, State, adjust
+from fieldkit.calibrate.geometry import Poses
+from fieldkit.calibrate.locating import LocatedPhoto, locate
+from fieldkit.calibrate.photos import find_tags, list_photos
+from fieldkit.calibrate.solving import solve_tags
+from fieldkit.frames import Pose, exp, log, mean_pose, pose_error
+from fieldkit.maps import build_map, fit_gauge, load_map
+from fieldkit.store import read_tags, read_tum
+from fieldkit.tags import solve, tag_corners
+from fieldkit.types import SceneMap
+from sim_bridge.mapping.photographer import PhotoOptions
+from sim_bridge.recording.schedule import ScheduleOptions
+from sim_bridge.stage.staging import StageOptions
+from sim_bridge.synthesize import SessionOptions, synthesize
+
+Array = NDArray[np.float64]
+SEEDS, SIZE_M, DRAWS = range(4), 0.1365, 200
+SIZES = {None: SIZE_M}
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One tag: its photos as localized, the map that they are in, and where tag and cameras truly are in it."""
+
+    photos: tuple[LocatedPhoto, ...]
+    xyz: Array
+    covariance: Array
+    map_from_tag: Pose
+    map_from_cams: tuple[Pose, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Errors (m, rad) of the joint solution, of the good photos alone and of the plain mean; what the bound draws."""
+
+    joint: tuple[float, float]
+    good_alone: tuple[float, float]
+    mean: tuple[float, float]
+    bound: Array
+    normalised: Array
+    nees: float
+    unnamed: int
+    lost: int
+
+
+def session(folder: Path, seed: int, photos: PhotoOptions, *, waypoints: int = 4) -> Path:
+    """Synthesize a session of the demo's room and build its map beside it."""
+    if not (folder / "lab.map" / "map.toml").is_file():
+        options = SessionOptions(
+            photos=photos, stage=StageOptions(waypoints=waypoints), schedule=ScheduleOptions(starts="once")
+        )
+        synthesize("room", folder / "session", seed=seed, options=options)
+        build_map(folder / "session" / "mapping", folder / "lab.map")
+    return folder
+
+
+def trials(folder: Path) -> list[Trial]:
+    """Localize a session's photos and return them tag by tag."""
+    scene_map = load_map(folder / "lab.map")
+    truth, photos = folder / "session" / "truth", folder / "session" / "photos"
+    map_from_world = fit_gauge(scene_map, dict(read_tum(truth / "mapping_poses.txt"))).world_from_map.inv()
+    cams = dict(read_tum(truth / "photo_poses.txt"))
+    shots, _ = find_tags(photos, list_photos(photos, None), SIZES, ("tag36h11",), None)
+    located, _ = locate(shots, scene_map, None, None)
+    return [
+        of_tag(
+            [p for p in located if [d.id for d in p.detections] == [tag.id]],
+            scene_map,
+            map_from_world * tag.map_from_tag,
+            {name: map_from_world * pose for name, pose in cams.items()},
+        )
+        for tag in read_tags(truth / "tags.toml").tags
+    ]
+
+
+def of_tag(photos: Sequence[LocatedPhoto], scene_map: SceneMap, tag: Pose, cams: dict[str, Pose]) -> Trial:
+    cams_of = tuple(cams[p.file] for p in photos)
+    return Trial(tuple(photos), scene_map.xyz, scene_map.xyz_covariance, tag, cams_of)
+
+
+def displaced(rng: np.random.Generator, trial: Trial, index: int) -> Trial:
+    """Localize a photo wrongly by 0.3 to 2 m: its landmarks, and so the photo, are elsewhere, all else fits."""
+    direction = rng.normal(size=3)
+    direction *= rng.uniform(0.3, 2.0) / np.linalg.norm(direction)
+    photo = trial.photos[index]
+    centre = Pose.from_translation(trial.map_from_tag.translation)
+    wrong = centre * exp([*rng.normal(0, math.radians(5), 3), *direction]) * centre.inv()
+    rows = len(trial.xyz) + np.arange(len(photo.landmark))
+    turn = wrong.rotation.as_matrix()
+    moved = dataclasses.replace(photo, map_from_cam=wrong * photo.map_from_cam, landmark=rows)
+    return dataclasses.replace(
+        trial,
+        photos=tuple(moved if i == index else p for i, p in enumerate(trial.photos)),
+        xyz=np.concatenate([trial.xyz, wrong.apply(trial.xyz[photo.landmark])]),
+        covariance=np.concatenate([trial.covariance, turn @ trial.covariance[photo.landmark] @ turn.T]),
+    )
+
+
+def flipped(trial: Trial, index: int) -> Trial:
+    """Put a photo's corners where the other planar solution has them."""
+    photo = trial.photos[index]
+    (detection,) = photo.detections
+    other = solve(detection, photo.camera, SIZE_M).alternative
+    assert other is not None
+    corners = photo.camera.project(other.apply(tag_corners(SIZE_M)))[0]
+    shown = dataclasses.replace(photo, detections=(dataclasses.replace(detection, corners_px=corners),))
+    return dataclasses.replace(trial, photos=tuple(shown if i == index else p for i, p in enumerate(trial.photos)))
+
+
+def run(trial: Trial, seed: int, *, spoil: bool) -> Outcome:
+    rng = np.random.default_rng([seed, int(spoil)])
+    given, wrong = trial, set[int]()
+    if spoil:
+        order = [int(i) for i in rng.permutation(len(trial.photos))]
+        for i in order[:2]:
+            given = displaced(rng, given, i)
+        both = [
+            i for i in order[2:] if solve(trial.photos[i].detections[0], trial.photos[i].camera, SIZE_M).alternative
+        ]
+        given = flipped(given, both[0])
+        wrong = {*order[:2], both[0]}
+    (tag,) = solve_tags(given.photos, given.xyz, given.covariance, sizes_m=SIZES).tags
+    good = [p for i, p in enumerate(trial.photos) if i not in wrong]
+    alone = solve_tags(good, trial.xyz, trial.covariance, sizes_m=SIZES).tags[0] if spoil else tag
+    error = log(tag.map_from_tag.inv() * trial.map_from_tag)
+    rejected = {s.sighted.photo for s in tag.sightings if not s.used}
+    named = rejected | {s.sighted.photo for s in tag.sightings if s.flipped}
+    return Outcome(
+        pose_error(tag.map_from_tag, trial.map_from_tag),
+        pose_error(alone.map_from_tag, trial.map_from_tag),
+        pose_error(plain_mean(given), trial.map_from_tag),
+        rng.normal(size=(DRAWS, 6)) @ np.linalg.cholesky(crb(trial, wrong)).T,
+        error / np.sqrt(np.diag(tag.covariance)),
+        float(error @ np.linalg.solve(tag.covariance, error)) / 6,
+        len(wrong - named),
+        len(rejected - wrong),
+    )
+
+
+def crb(trial: Trial, left_out: set[int]) -> Array:
+    """Return the Cramer-Rao bound on the tag's covariance: inverse information of the good photos, at the truth."""
+    good = [i for i in range(len(trial.photos)) if i not in left_out]
+    photos = [trial.photos[i] for i in good]
+    landmarks = Landmarks.of([(p.landmark, p.bearings) for p in photos], trial.xyz, trial.covariance)
+    corners = Corners.of([(i, 0, p.camera, d) for i, p in enumerate(photos) for d in p.detections])
+    cams = Poses.of([trial.map_from_cams[i] for i in good])
+    state = State(cams, Poses.of([trial.map_from_tag]), np.array([SIZE_M]))
+    return adjust(landmarks, corners, state, used=np.ones(len(corners), dtype=bool), iterations=0).tag_covariance(0)
+
+
+def plain_mean(trial: Trial) -> Pose:
+    """Return the mean of what each photo has by itself: as it is localized, and its better planar solution."""
+    return mean_pose([p.map_from_cam * solve(p.detections[0], p.camera, SIZE_M).cam_from_tag for p in trial.photos])[0]
+
+
+def line(name: str, found: Sequence[Outcome]) -> str:
+    joint, alone, mean = (
+        np.array([getattr(o, k) for o in found]) * [1e3, 180 / math.pi] for k in ("joint", "good_alone", "mean")
+    )
+    drawn = np.concatenate([o.bound for o in found])
+    bound = (
+        1e3 * np.median(np.linalg.norm(drawn[:, 3:], axis=1)),
+        np.degrees(np.median(np.linalg.norm(drawn[:, :3], axis=1))),
+    )
+    nees = np.sort([o.nees for o in found])
+    middle, ratio = np.median(joint, axis=0), np.median(joint / alone, axis=0)
+    cells = [
+        name,
+        f"{middle[0]:.2f} mm {middle[1]:.3f} deg",
+        f"{joint[:, 0].max():.1f} mm {joint[:, 1].max():.2f} deg",
+        f"{middle[0] / bound[0]:.2f} {middle[1] / bound[1]:.2f}",
+        f"{np.median(mean[:, 0]):.2f} mm {np.median(mean[:, 1]):.3f} deg",
+        f"{ratio[0]:.3f} {ratio[1]:.3f}",
+        f"{nees[: math.ceil(0.98 * len(nees)) - 1].mean():.2f}",
+        f"{100 * np.mean(nees > 22.46 / 6):.0f} %",
+        f"{100 * np.mean(np.abs([o.normalised for o in found]) < 2):.1f} %",
+        f"{sum(o.unnamed == 0 for o in found)} of {len(found)}",
+        f"{sum(o.lost == 0 for o in found)} of {len(found)}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+HEAD = (
+    "| photos | median error | largest | over the bound | plain mean | over good photos alone | NEES/6 | outliers | "
+    "within 2 sigma | all wrong named | no good lost |\n|" + "---|" * 11
+)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> list[Trial]:
+    folder = tmp_path_factory.mktemp("rendered")
+    options = PhotoOptions(tripod_photos=8)
+    return [t for seed in SEEDS for t in trials(session(folder / str(seed), seed, options))]
+
+
+@pytest.mark.benchmark(group="tags")
+def test_accuracy_through_rendered_photos(
+    benchmark: Any, capsys: pytest.CaptureFixture[str], rendered: list[Trial]
+) -> None:
+    def table() -> list[str]:
+        return [
+            line(name, [run(t, i, spoil=spoil) for i, t in enumerate(rendered)])
+            for name, spoil in (("clean", False), ("2 localized wrongly, 1 flipped", True))
+        ]
+
+    lines = benchmark.pedantic(table, rounds=1, iterations=1)
+    with capsys.disabled():
+        print("\n".join(["", HEAD, *lines]))  # noqa: T201
+
+
+@pytest.mark.benchmark(group="tags")
+def test_calibrate_twenty_photos_of_24_megapixels(benchmark: Any, tmp_path: Path) -> None:
+    folder = session(tmp_path, 0, PhotoOptions(start_photos=14, tripod_photos=6, scale=math.sqrt(2.0)), waypoints=1)
+    photos, scene_map = folder / "session" / "photos", folder / "lab.map"
+    found = benchmark.pedantic(lambda: calibrate_tags(photos, scene_map, sizes_m=SIZES), rounds=3, warmup_rounds=1)
+    assert len(found.photos) == 20
