@@ -118,9 +118,7 @@ def _photo(
         noise = corner_noise(rng, corner_px)
         detections.append(TagDetection(tag_id, "tag36h11", drawn(rng, corners, noise), corner_px, noise))
     start = map_from_cam * exp(rng.normal(0, [0.002] * 3 + [0.005] * 3))
-    return LocatedPhoto(
-        file, None, PHOTO, start, np.zeros((6, 6)), rows[chosen], bearings(PHOTO, noisy, 1.0), tuple(detections)
-    )
+    return LocatedPhoto(file, None, PHOTO, start, rows[chosen], bearings(PHOTO, noisy, 1.0), tuple(detections))
 
 
 def corner_noise(rng: np.random.Generator, corner_px: float) -> Array:

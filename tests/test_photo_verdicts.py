@@ -192,14 +192,6 @@ def test_photos_that_are_all_off_raise_the_scale_and_the_covariance_and_lose_non
     assert (np.abs(error.translation) < 4 * np.sqrt(np.diag(moved.tags[0].covariance)[3:])).all()
 
 
-def test_what_all_photos_share_is_added_once() -> None:
-    of = scene(12)
-    shared = np.diag([0.0] * 3 + [0.003**2] * 3)
-    photos = [dataclasses.replace(p, shared=shared) for p in of.photos]
-    added = solve(of, photos).tags[0].covariance - solve(of).tags[0].covariance
-    np.testing.assert_allclose(added[3:, 3:], np.eye(3) * 0.003**2, atol=1e-9)
-
-
 def test_wrong_matches_do_not_enter_and_noisy_pixels_count_less() -> None:
     of, rng = scene(13, map_sigma_m=0.0005), np.random.default_rng(13)
     cam, photo = of.map_from_cams[0], of.photos[0]

@@ -11,7 +11,7 @@ from fieldkit.calibrate.second import check_in_second_map
 from fieldkit.calibrate.solving import solve_tags
 from fieldkit.calibrate.verdicts import photo_verdicts, tag_pose, warn
 from fieldkit.errors import TagError
-from fieldkit.maps import load_map
+from fieldkit.maps import load_map, map_warp
 from fieldkit.protocol import LocalizerRules
 from fieldkit.types import SceneMap, TagMap
 
@@ -60,9 +60,9 @@ def calibrate_photos(
     """Find map_from_tag of every tag in a folder of photos, with covariance and a verdict on every photo.
 
     Every photo is localized in the map; then photos, landmarks and tags are one least-squares problem. The covariance
-    has the noise of corners, of keypoints and of the landmarks, what the landmarks of a place share as the localizer
-    takes it, and is scaled up to what the photos show. A warp or wrong scale of the map, which all photos share, and
-    an error of the tag's size that the map does not contradict are not in it.
+    has the noise of corners, of keypoints and of the landmarks, and how far the map may be bent (`map_warp`); it is
+    scaled up to what the photos show. A wrong scale of the map and an error of the tag's size that the map does not
+    contradict are not in it.
 
     The folder holds photos.toml, or photos of one camera (``camera``, else camera.toml in the folder). ``sizes_m`` as
     `parse_sizes` returns it. A tag whose photos all name a visit gets one pose per visit. One that is also in photos
@@ -80,7 +80,8 @@ def calibrate_photos(
             f"{photos}: no photo of a tag could be localized in {scene_map.path} ({reasons[0]}); expected at least one",
             hint="take photos that show the tag and much of its mapped surroundings",
         )
-    solved = solve_tags(located, scene_map.xyz, scene_map.xyz_covariance, sizes_m=sizes_m)
+    warp = map_warp(scene_map)
+    solved = solve_tags(located, scene_map.xyz, scene_map.xyz_covariance, sizes_m=sizes_m, warp=warp)
     everything = photo_verdicts(solved, located) + rejected
     warn(solved.tags, everything)
     order = {p.file: i for i, p in enumerate(listed)}

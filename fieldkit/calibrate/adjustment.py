@@ -48,8 +48,12 @@ class LandmarkTerm(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Landmarks:
-    """Observations (o) of landmarks (l) by photos: indices, bearings, and the landmarks as the map has them."""
+    """Observations (o) of landmarks (l) by photos: indices, bearings, and the landmarks as the map has them.
 
+    ``rows`` int[l] are the landmarks' rows in the map.
+    """
+
+    rows: Ints
     photo: Ints
     landmark: Ints
     bearings: Bearings
@@ -63,7 +67,7 @@ class Landmarks:
         photo = np.repeat(np.arange(len(seen)), [len(rows) for rows, _ in seen])
         used, landmark = np.unique(np.concatenate([rows for rows, _ in seen]), return_inverse=True)
         stacked = Bearings(np.concatenate([b.xy for _, b in seen]), np.concatenate([b.whitening for _, b in seen]))
-        return Landmarks(photo, landmark, stacked, xyz[used], np.linalg.inv(covariance[used]), len(seen))
+        return Landmarks(used, photo, landmark, stacked, xyz[used], np.linalg.inv(covariance[used]), len(seen))
 
     @property
     def freedom(self) -> int:
@@ -92,6 +96,19 @@ class Landmarks:
         for i in range(self.n_photos):
             normal[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += own[i]
         return Reduced(normal.reshape(size, size), gradient + direct.reshape(-1), chi2)
+
+    def response(self, centre: Poses, normal: Array) -> Array:
+        """Return f64[6p, 3l]: how the cameras follow displacements of the landmarks in the map, to first order.
+
+        ``centre`` and ``normal`` (6p, 6p) as `adjust_cameras` finds them.
+        """
+        residual, by_camera, by_landmark = self._linearise(centre, self.xyz)
+        hessian, _ = self._by_landmark(residual, by_landmark, self.xyz)
+        believed = np.linalg.solve(hessian, self.information)
+        blocks = -by_camera.transpose(0, 2, 1) @ by_landmark @ believed[self.landmark]
+        pulls = np.zeros((self.n_photos, len(self.xyz), 6, 3))
+        np.add.at(pulls, (self.photo, self.landmark), blocks)
+        return np.asarray(np.linalg.solve(normal, pulls.transpose(0, 2, 1, 3).reshape(6 * self.n_photos, -1)))
 
     def _linearise(self, cameras: Poses, xyz: Array) -> tuple[Array, Array, Array]:
         """Return whitened residuals (o, 2) and the derivative by camera (o, 2, 6) and by landmark (o, 2, 3)."""
@@ -141,6 +158,11 @@ class FixedLandmarks:
     def camera_covariance(self, photo: int) -> Array:
         """Return the 6x6 covariance of one camera."""
         return self.covariance[6 * photo : 6 * photo + 6, 6 * photo : 6 * photo + 6]
+
+    def warped(self, shared: Array) -> FixedLandmarks:
+        """Return the same with the covariance ``shared`` f64[6p, 6p] of what the landmarks are wrong by together."""
+        total = _symmetric(self.covariance + shared)
+        return FixedLandmarks(self.centre, _symmetric(np.asarray(np.linalg.inv(total), dtype=np.float64)), self.chi2)
 
     def loosened(self, scale: float) -> FixedLandmarks:
         """Return the same with every camera ``scale`` times as uncertain, the excess independent between photos.

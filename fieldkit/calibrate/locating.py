@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fieldkit.calibrate.geometry import Bearings, Poses, bearings, project
 from fieldkit.calibrate.photos import Shot, describe_blur, read_photo
 from fieldkit.cameras import Camera
-from fieldkit.frames import Array, Pose
+from fieldkit.frames import Pose
 from fieldkit.localize import Inliers, Localizer
 from fieldkit.protocol import LocalizerRules
 from fieldkit.tags import TagDetection
@@ -35,15 +35,13 @@ MEDIAN_CHI2 = 1.386
 class LocatedPhoto:
     """A localized photo: its pose, what it knows it from, and the tags in it.
 
-    ``landmark`` int[n] are rows of the map, ``bearings`` (n) where they are seen. ``shared`` is the 6x6 covariance of
-    what all photos of the place are wrong by together, which no number of landmarks averages out.
+    ``landmark`` int[n] are rows of the map, ``bearings`` (n) where they are seen.
     """
 
     file: str
     visit: str | None
     camera: Camera
     map_from_cam: Pose
-    shared: Array
     landmark: NDArray[np.int64]
     bearings: Bearings
     detections: tuple[TagDetection, ...]
@@ -75,7 +73,7 @@ def locate(
             continue
         located.append(
             LocatedPhoto(
-                photo.file, photo.visit, photo.camera, estimate.map_from_cam, inliers.shared, landmark, seen,
+                photo.file, photo.visit, photo.camera, estimate.map_from_cam, landmark, seen,
                 shot.usable,
             )
         )  # fmt: skip

@@ -16,7 +16,7 @@ from fieldkit.calibrate.solving import place_photos
 from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, exp
 from fieldkit.frames import log as pose_log
-from fieldkit.maps import load_map
+from fieldkit.maps import load_map, map_warp
 from fieldkit.types import SceneMap
 
 # Squared deviation of a photo (6 degrees of freedom) beyond which its two poses contradict each other: one in 10^4
@@ -119,8 +119,8 @@ def look_again(
 def _placed(located: Sequence[LocatedPhoto], files: Sequence[str], scene_map: SceneMap) -> list[tuple[Pose, Array]]:
     """Return map_from_cam and its covariance of every photo, from its landmarks."""
     chosen = [p for p in located if p.file in files]
-    fixed, _ = place_photos(chosen, scene_map.xyz, scene_map.xyz_covariance)
-    return [(fixed.centre.pose(i), fixed.camera_covariance(i) + p.shared) for i, p in enumerate(chosen)]
+    fixed, _ = place_photos(chosen, scene_map.xyz, scene_map.xyz_covariance, map_warp(scene_map))
+    return [(fixed.centre.pose(i), fixed.camera_covariance(i)) for i in range(len(chosen))]
 
 
 def compare(

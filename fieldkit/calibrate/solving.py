@@ -18,13 +18,14 @@ from fieldkit.calibrate.adjustment import (
     State,
     adjust_cameras,
 )
-from fieldkit.calibrate.agreement import Agreement, agree, settle, without
+from fieldkit.calibrate.agreement import BELIEVED, Agreement, agree, settle, without
 from fieldkit.calibrate.geometry import Poses
 from fieldkit.calibrate.locating import LocatedPhoto
 from fieldkit.calibrate.starting import Group, Homeless, Sighted, group, sight
 from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, compose_covariance, pose_error
 from fieldkit.frames import log as pose_log
+from fieldkit.maps import MapWarp
 from fieldkit.types import TAG_BOUNDS
 
 # A photo known no better than this is not localized
@@ -105,15 +106,21 @@ class _Problem:
 
 
 def solve_tags(
-    photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array, *, sizes_m: Mapping[int | None, float]
+    photos: Sequence[LocatedPhoto],
+    xyz: Array,
+    covariance: Array,
+    *,
+    sizes_m: Mapping[int | None, float],
+    warp: MapWarp | None = None,
 ) -> Solved:
     """Solve for the poses of all tags in localized photos, in a map with landmarks (l, 3) and covariances (l, 3, 3).
 
+    ``warp`` (`fieldkit.maps.map_warp`) is what the landmarks are wrong by together; without it they are independent.
     First with all photos, to find those that agree; then with these alone, since a rejected one must not pull on the
     landmarks either. Raises TagError where the photos determine no pose.
     """
     try:
-        return _solve(photos, xyz, covariance, sizes_m)
+        return _solve(photos, xyz, covariance, sizes_m, warp)
     except np.linalg.LinAlgError as error:
         raise TagError(
             f"the {len(photos)} localized photos determine no pose ({error}); expected landmarks all over each photo",
@@ -122,9 +129,13 @@ def solve_tags(
 
 
 def _solve(
-    photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array, sizes_m: Mapping[int | None, float]
+    photos: Sequence[LocatedPhoto],
+    xyz: Array,
+    covariance: Array,
+    sizes_m: Mapping[int | None, float],
+    warp: MapWarp | None,
 ) -> Solved:
-    fixed, _ = place_photos(photos, xyz, covariance)
+    fixed, _ = place_photos(photos, xyz, covariance, warp)
     poses = [fixed.centre.pose(i) for i in range(len(photos))]
     blocks = [fixed.camera_covariance(i) for i in range(len(photos))]
     groups, homeless = group(sight(photos, poses, blocks, sizes_m), sizes_m)
@@ -135,23 +146,31 @@ def _solve(
     start = problem.start(sizes.solved_m)
     agreed = agree(fixed, problem.corners, start, used=consensus, free_sizes=sizes.is_wrong)
     kept = np.unique(problem.corners.photo[agreed.adjusted.used])
-    alone, excess = place_photos([photos[i] for i in kept], xyz, covariance)
+    alone, excess = place_photos([photos[i] for i in kept], xyz, covariance, warp)
     final, corners, rows = _settle(problem, agreed, kept, alone, sizes.is_wrong)
     sightings = _sightings(problem, agreed, final, corners, rows)
-    tags = [_tag(t, problem, final, sightings, [p.shared for p in photos], sizes.of(t)) for t in range(len(groups))]
+    tags = [_tag(t, problem, final, sightings, sizes.of(t)) for t in range(len(groups))]
     return Solved(tuple(tags), tuple(homeless), final.scale * math.sqrt(excess))
 
 
-def place_photos(photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array) -> tuple[FixedLandmarks, float]:
-    """Return what the landmarks say about the photos, and the factor of their variance that residuals show, from 1."""
+def place_photos(
+    photos: Sequence[LocatedPhoto], xyz: Array, covariance: Array, warp: MapWarp | None = None
+) -> tuple[FixedLandmarks, float]:
+    """Return what the landmarks say about the photos, and the factor of their variance that residuals show.
+
+    With ``warp`` the photos' covariance has what errors of the mapping images do to all landmarks together.
+    """
     landmarks = Landmarks.of([(p.landmark, p.bearings) for p in photos], xyz, covariance)
     found = adjust_cameras(landmarks, Poses.of([p.map_from_cam for p in photos]))
-    excess = max(1.0, found.chi2 / max(landmarks.freedom, 1))
+    excess = (BELIEVED + found.chi2) / (BELIEVED + max(landmarks.freedom, 0))
     fixed = FixedLandmarks(found.centre, found.normal / excess, found.chi2 / excess)
     for i, photo in enumerate(photos):
         variance = float(np.trace(fixed.camera_covariance(i)[3:, 3:]))
         if not 0.0 < variance < LOST_SIGMA_M**2:
             raise np.linalg.LinAlgError(f"the landmarks in {photo.file} leave it open")
+    if warp is not None:
+        shared = warp.covariance(landmarks.rows, landmarks.response(found.centre, found.normal))
+        fixed = fixed.warped(shared)
     return fixed, excess
 
 
@@ -245,24 +264,14 @@ def _tag(
     problem: _Problem,
     final: Agreement,
     sightings: Sequence[SolvedSighting],
-    shared: Sequence[Array],
     size: SizeCheck,
 ) -> SolvedTag:
     own = [s for s, t in zip(sightings, problem.corners.tag, strict=True) if t == tag]
     map_from_tag = final.adjusted.state.tags.pose(tag)
-    # What photos are wrong by together is carried to the tag once: the mean over photos, not divided by their number
-    common = np.mean(
-        [
-            compose_covariance(shared[s.sighted.photo], s.sighted.sighting.ref_from_cam.inv() * map_from_tag)
-            for s in own
-            if s.used
-        ],
-        axis=0,
-    )
     return SolvedTag(
         problem.groups[tag],
         map_from_tag,
-        final.adjusted.tag_covariance(tag) * final.inflation + common,
+        final.adjusted.tag_covariance(tag) * final.inflation,
         float(np.sqrt(np.mean([s.residual_px**2 for s in own if s.used]))),
         tuple(own),
         size,

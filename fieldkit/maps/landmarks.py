@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
+from fieldkit.types import SceneMap
 
 Array = NDArray[np.float64]
+
+# Keeps a landmark that is seen along one ray finite
+PRIOR_M = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,10 +116,10 @@ def _camera(camera: pycolmap.Camera) -> Camera:
     return Camera(camera.model_name, camera.width, camera.height, tuple(float(v) for v in camera.params))
 
 
-def reprojection_errors(model: Model) -> Array:
+def reprojection_errors(model: Model | SceneMap) -> Array:
     """Return the distance (px) between every observation and its projected landmark; inf behind the camera."""
     errors = np.full(len(model.observation_image), np.inf)
-    for i, rows in _by_image(model.observation_image, len(model.image_names)):
+    for i, rows in observations_of(model.observation_image, len(model.image_names)):
         x_in_cam = model.map_from_image[i].inv().apply(model.xyz[model.observation_landmark[rows]])
         pixels, _ = model.image_cameras[i].project(x_in_cam)
         distance = np.linalg.norm(pixels - model.observation_px[rows], axis=1)
@@ -151,7 +155,7 @@ def landmark_covariance(
     image_cameras: Sequence[Camera],
     *,
     noise_px: float = 1.0,
-    prior_m: float = 10.0,
+    prior_m: float = PRIOR_M,
 ) -> Array:
     """Return f64[n, 3, 3] in m^2: the inverse of the summed information of each landmark's observations.
 
@@ -159,7 +163,7 @@ def landmark_covariance(
     ``prior_m`` keeps landmarks seen along one ray finite. Hartley and Zisserman, Multiple View Geometry, 5.2.
     """
     information = np.tile(np.eye(3) / prior_m**2, (len(xyz), 1, 1))
-    for i, rows in _by_image(observation_image, len(map_from_image)):
+    for i, rows in observations_of(observation_image, len(map_from_image)):
         jacobian = projection_jacobian(xyz[observation_landmark[rows]], map_from_image[i], image_cameras[i])
         np.add.at(information, observation_landmark[rows], np.einsum("nki,nkj->nij", jacobian, jacobian) / noise_px**2)
     return np.asarray(np.linalg.inv(information))
@@ -178,7 +182,7 @@ def projection_jacobian(xyz: Array, map_from_cam: Pose, camera: Camera) -> Array
     return np.asarray(inner @ cam_from_map.rotation.as_matrix())
 
 
-def _by_image(observation_image: NDArray[np.int32], count: int) -> list[tuple[int, slice]]:
+def observations_of(observation_image: NDArray[np.int32], count: int) -> list[tuple[int, slice]]:
     """Return (image, its rows) for observations that are sorted by image."""
     bounds = np.searchsorted(observation_image, np.arange(count + 1))
     return [(i, slice(int(bounds[i]), int(bounds[i + 1]))) for i in range(count) if bounds[i] < bounds[i + 1]]
