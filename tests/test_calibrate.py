@@ -66,7 +66,10 @@ def looking_at_wall(x: float, y: float, distance: float, yaw_deg: float = 0.0, p
 
 
 def build(texture: Image, rng: np.random.Generator, *, feature: str = "sift") -> SceneMap:
-    """Make a map from one image of the wall: its keypoints, back-projected onto the wall, are the landmarks."""
+    """Make a map from one image of the wall: its keypoints, back-projected onto the wall, are the landmarks.
+
+    Three more images, which are not drawn, see the landmarks where they are.
+    """
     map_from_cam = looking_at_wall(0.0, 0.0, 1.7)
     features = extract(photograph(texture, MAPPING, map_from_cam, rng), feature=feature, max_keypoints=2000)
     rays = map_from_cam.rotation.apply(MAPPING.unproject(features.keypoints_px))
@@ -74,10 +77,18 @@ def build(texture: Image, rng: np.random.Generator, *, feature: str = "sift") ->
     depth = (MAP_FROM_WALL.translation - map_from_cam.translation) @ normal / (rays @ normal)
     xyz = map_from_cam.translation + rays * depth[:, None]
     n = len(xyz)
-    zeros, every = np.zeros(n, np.int32), np.arange(n, dtype=np.int32)
+    poses = (map_from_cam, *(looking_at_wall(*a) for a in ((0, 0, 1.6, 25), (0, 0, 1.8, -25), (0, 0, 1.7, 0, 20))))
+    seen = [np.arange(n, dtype=np.int32)]
+    pixels = [features.keypoints_px]
+    for pose in poses[1:]:
+        projected, visible = MAPPING.project(pose.inv().apply(xyz))
+        seen.append(np.flatnonzero(visible).astype(np.int32))
+        pixels.append(projected[visible] + rng.normal(0, 0.3, (int(visible.sum()), 2)))
+    image = np.repeat(np.arange(len(poses), dtype=np.int32), [len(s) for s in seen])
     return SceneMap(
-        "wall.map", "digest", feature, xyz, np.tile(np.eye(3) * 1e-6, (n, 1, 1)), ("0.jpg",), (MAPPING,),
-        (map_from_cam,), every, zeros, features.keypoints_px.astype(np.float32), features.descriptors, every, zeros,
+        "wall.map", "digest", feature, xyz, np.tile(np.eye(3) * 1e-6, (n, 1, 1)),
+        tuple(f"{i}.jpg" for i in range(len(poses))), (MAPPING,) * len(poses), poses, np.concatenate(seen), image,
+        np.concatenate(pixels).astype(np.float32), features.descriptors, seen[0], np.zeros(n, np.int32),
     )  # fmt: skip
 
 

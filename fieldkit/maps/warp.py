@@ -51,7 +51,8 @@ class MapWarp:
         rows = (3 * np.asarray(landmark, dtype=np.int64)[:, None] + np.arange(3)).ravel()
         by_images = np.asarray((self.pulls[rows].T @ response.T).T)
         # The map is laid on SLAM's positions: what moves all images together is no error (Baarda's S-transformation)
-        by_images = by_images - by_images @ self.free @ np.linalg.solve(self.held.T @ self.free, self.held.T)
+        back = np.linalg.pinv(self.held.T @ self.free) @ self.held.T
+        by_images = by_images - by_images @ self.free @ back
         spread = by_images @ self.factor.solve(np.ascontiguousarray(by_images.T))
         return np.asarray(self.sigma_px**2 * (spread + spread.T) / 2)
 
