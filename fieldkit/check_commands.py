@@ -52,11 +52,13 @@ def tags_check(
         force: replace existing files
     """
     from fieldkit import store
+    from fieldkit.tags import check_families
 
     outputs = [path for path in (refine_camera, refine_hand) if path is not None]
     for path in outputs:
         store.refuse_existing(path, force=force, kind="file")
     loaded = store.read_tags(tags)
+    check_families(loaded)
     if recording is None and (outputs or not distance):
         raise TagError(
             f"{tags}: nothing to check{' with' if outputs else ''}; expected --distance A B METRES or --recording",

@@ -102,12 +102,12 @@ def tags_calibrate(
     size_m: Repeated[tuple[str, ...]],
     camera: Path | None = None,
     check_map: Path | None = None,
-    family: Repeated[tuple[str, ...]] = ("tag36h11",),
+    family: Repeated[tuple[str, ...]] = (),
     detector: Literal["pupil", "opencv"] | None = None,
     json: bool = False,
     force: bool = False,
-) -> None:
-    """Find the poses of AprilTags in a map from photos of them.
+) -> int:
+    """Find the poses of AprilTags in a map from photos of them; exit with 3 when --check-map contradicts the map.
 
     Args:
         photos: folder with photos, and photos.toml where cameras or visits differ
@@ -116,41 +116,48 @@ def tags_calibrate(
         size_m: edge length of the black square in m, or ID:SIZE for one tag; may be repeated
         camera: camera.toml of the photos, where photos.toml names none
         check_map: another map of the place, such as one of another feature: compare where it localizes the photos
-        family: tag family; may be repeated
+        family: tag family, by default tag36h11; may be repeated
         detector: what finds the tags; by default pupil, and opencv for tag36h10
         json: print JSON
         force: replace an existing file
     """
     from fieldkit import store
-    from fieldkit.calibrate import calibrate_tags, check_in_second_map, parse_sizes
+    from fieldkit.calibrate import calibrate_photos, check_in_second_map, parse_sizes, refuse_same_map
+    from fieldkit.maps import load_map
 
     store.refuse_existing(out, force=force, kind="file")
-    sizes_m, second = parse_sizes(size_m), None
+    sizes_m, families, second = parse_sizes(size_m), family or ("tag36h11",), None
+    scene_map = load_map(map)
+    other = None if check_map is None else load_map(check_map)
+    if other is not None:
+        refuse_same_map(scene_map, other)
     with ProgressBars() as progress:
-        tags = calibrate_tags(
-            photos, map, camera=camera, sizes_m=sizes_m, families=family, detector=detector, progress=progress
+        tags = calibrate_photos(
+            photos, scene_map, camera=camera, sizes_m=sizes_m, families=families, detector=detector, progress=progress
         )
-        store.write_tags(out, tags)
-        if check_map is not None:
+        if other is not None:
             second = check_in_second_map(
                 photos,
-                map,
-                check_map,
+                scene_map,
+                other,
                 camera=camera,
                 sizes_m=sizes_m,
-                families=family,
+                families=families,
                 detector=detector,
                 progress=progress,
             )
+    store.write_tags(out, tags)
+    contradicted = 3 if second is not None and second.verdict == "fail" else 0
     if json:
         print_json(tags_json(tags) | ({} if second is None else {"second_map": second_json(second)}))
-        return
+        return contradicted
     print_tags(tags)
     if second is not None:
         print_second(second)
     for photo in tags.photos:
         if not photo.used:
             logging.getLogger(__name__).warning("%s: not used: %s", photo.file, photo.reason)
+    return contradicted
 
 
 def localize(

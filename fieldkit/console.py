@@ -37,7 +37,9 @@ class ProgressBars:
         return self._update
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        # Stopping one that never started would print an empty line before a mistake's one line
+        if self._steps:
+            self._progress.stop()
 
     def _update(self, what: str, done: int, total: int) -> None:
         # Shown from the first step on: a mistake that is found before it stays one line.

@@ -23,6 +23,7 @@ from fieldkit.localize import Localizer
 from fieldkit.odometry import offset_fault, summarize_faults
 from fieldkit.prior import estimate_prior, odometry_clock
 from fieldkit.protocol import Protocol
+from fieldkit.tags import check_families
 from fieldkit.trust import trust
 from fieldkit.truth import estimate_truths
 from fieldkit.types import (
@@ -114,6 +115,7 @@ def _load_tags(path: Path | None, scene_map: SceneMap) -> TagMap:
             f"{scene_map.path}",
             hint="calibrate the tags in this map",
         )
+    check_families(tags)
     return tags
 
 

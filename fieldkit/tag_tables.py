@@ -38,7 +38,7 @@ def _table(tags: TagMap) -> Table:
         "verdict", "why",
     )  # fmt: skip
     for t in tags.tags:
-        own = _photos(tags, t)
+        own = tags.photos_of(t)
         position, rotation = sigmas(t.covariance)
         spread = [p.offset[0] for p in own if p.used and p.offset is not None]
         without = t.leave_one_out
@@ -59,12 +59,6 @@ def _table(tags: TagMap) -> Table:
     return table
 
 
-def _photos(tags: TagMap, tag: TagPose) -> list[TagPhoto]:
-    return [p for p in tags.photos if (p.tag_id, p.visit) == (tag.id, tag.visit)] or [
-        p for p in tags.photos if p.tag_id == tag.id and tag.visit is None
-    ]
-
-
 def tags_json(tags: TagMap) -> dict[str, Any]:
     """Return tags and photos as plain values; None where nothing tells."""
     return {
@@ -79,6 +73,7 @@ def _tag_json(t: TagPose) -> dict[str, Any]:
     without, size = t.leave_one_out, t.size_from_map
     return {
         "id": t.id,
+        "family": t.family,
         "visit": t.visit,
         "position_m": t.map_from_tag.translation,
         "quaternion_xyzw": t.map_from_tag.rotation.as_quat(),

@@ -222,6 +222,10 @@ class TagMap:
                     return tag
         return None
 
+    def photos_of(self, tag: TagPose) -> list[TagPhoto]:
+        """Return the photos of a tag; one that has the same place at every visit has those of every visit."""
+        return [p for p in self.photos if p.tag_id == tag.id and tag.visit in (None, p.visit)]
+
 
 @dataclasses.dataclass(frozen=True)
 class Surface:

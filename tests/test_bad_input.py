@@ -21,7 +21,9 @@ def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     """Run the command line, expect status 1 and exactly one line of error; return it."""
     with pytest.raises(SystemExit) as stop:
         main([str(w) for w in words])
-    said = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    text = capsys.readouterr().err
+    assert not text.startswith("\n")
+    said = [line for line in text.splitlines() if line.strip()]
     lines = [line for line in said if line.startswith("fieldkit: ")]
     assert stop.value.code == 1
     assert lines == said[-1:], said

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fieldkit.calibrate import calibrate_photos, calibrate_tags, parse_sizes
+from fieldkit.calibrate import calibrate_photos, parse_sizes
 from fieldkit.cameras import Camera
-from fieldkit.errors import StoreError, TagError
+from fieldkit.cli import tags_calibrate
+from fieldkit.errors import MapError, TagError
 from fieldkit.features import extract
 from fieldkit.frames import Pose, pose_error
 from fieldkit.store import PhotoEntry, read_tags, write_camera, write_photos, write_tags
@@ -266,6 +267,28 @@ def test_two_photos_that_disagree_fail_the_tag(wall_photos: Wall, tmp_path: Path
     (tag,) = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M}).tags
     assert (tag.n_photos, tag.verdict) == (1, "fail")
     assert tag.reason.startswith("no two of its 2 photos agree")
+    # 15 cm apart, and nothing tells which one is right
+    assert np.trace(tag.covariance[3:, 3:]) > 0.14**2
+
+
+def test_photos_that_are_refused_count_as_rejected(wall_photos: Wall, tmp_path: Path) -> None:
+    entries = [(f"a{i}.png", None) for i in range(5)]
+    folder = listed(wall_photos, tmp_path / "p", entries)
+    for i in (3, 4):
+        soft = cv2.GaussianBlur(cv2.imread(str(wall_photos.folder / f"a{i}.png")), (0, 0), 2.5)
+        (folder / f"a{i}.png").unlink()
+        cv2.imwrite(str(folder / f"a{i}.png"), soft)
+    (tag,) = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M}).tags
+    assert (tag.n_photos, tag.verdict, tag.reason) == (3, "warn", "2 of 5 photos are rejected")
+
+
+def test_one_id_in_two_families_is_refused(wall_photos: Wall, tmp_path: Path) -> None:
+    folder = listed(wall_photos, tmp_path / "p", [("a0.png", None), ("other.png", None)])
+    other = cv2.copyMakeBorder(draw_tag("tag25h9", 1, cell_px=20), 300, 300, 400, 400, cv2.BORDER_CONSTANT, value=150)
+    cv2.imwrite(str(folder / "other.png"), cv2.resize(other, (PHOTO.width, PHOTO.height)))
+    message = r"p: tag 1 is of tag36h11 in a0\.png and of tag25h9 in other\.png; expected one family per id; choose one"
+    with pytest.raises(TagError, match=message):
+        calibrate_photos(folder, wall_photos.scene_map, sizes_m={None: SIZE_M}, families=("tag36h11", "tag25h9"))
 
 
 def test_what_is_wrong_with_the_photos_is_named(wall_photos: Wall, tmp_path: Path) -> None:
@@ -307,9 +330,41 @@ def test_a_photo_that_cannot_be_read_is_rejected_and_the_others_count(wall_photo
     ]
 
 
+def test_a_photo_that_was_copied_in_part_is_rejected(wall_photos: Wall, tmp_path: Path) -> None:
+    folder = listed(wall_photos, tmp_path / "p", [("a0.png", None), ("part.jpg", None)])
+    whole = cv2.imencode(".jpg", cv2.imread(str(wall_photos.folder / "a1.png")))[1].tobytes()
+    (folder / "part.jpg").write_bytes(whole[: len(whole) * 9 // 10])
+    tags = calibrate_photos(folder, wall_photos.scene_map, sizes_m={1: SIZE_M})
+    assert [p.reason for p in tags.photos if p.file == "part.jpg"] == ["the file is cut short; copy it again"]
+
+
+def test_the_second_map_is_read_before_photos_and_its_contradiction_is_the_exit_status(
+    wall_photos: Wall, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = {"lab.map": wall_photos.scene_map, "bad.map": bent(wall_photos.scene_map)}
+    monkeypatch.setattr("fieldkit.maps.load_map", lambda path: maps[path.name])
+    out, size_m = tmp_path / "tags.toml", (str(SIZE_M),)
+    with pytest.raises(TagError, match="is the map that is checked"):
+        tags_calibrate(wall_photos.folder, map=Path("lab.map"), check_map=Path("lab.map"), out=out, size_m=size_m)
+    assert not out.exists()
+    assert (
+        tags_calibrate(wall_photos.folder, map=Path("lab.map"), check_map=Path("bad.map"), out=out, size_m=size_m) == 3
+    )
+    assert "fail" in capsys.readouterr().out
+
+
+def bent(scene_map: SceneMap) -> SceneMap:
+    """Return the map with its wall bent by decimetres."""
+    xyz = scene_map.xyz.copy()
+    xyz[:, 1] += 0.3 * np.sin(4 * xyz[:, 0])
+    return dataclasses.replace(scene_map, xyz=xyz, digest="bent", path="bad.map")
+
+
 def test_a_missing_map_is_named_before_photos_are_read(wall_photos: Wall, tmp_path: Path) -> None:
-    with pytest.raises((StoreError, TagError, Exception), match=r"absent\.map"):
-        calibrate_tags(wall_photos.folder, tmp_path / "absent.map", sizes_m={None: SIZE_M})
+    out = tmp_path / "tags.toml"
+    with pytest.raises(MapError, match=r"absent\.map"):
+        tags_calibrate(wall_photos.folder, map=tmp_path / "absent.map", out=out, size_m=(str(SIZE_M),))
+    assert not out.exists()
 
 
 def test_sizes_are_parsed() -> None:

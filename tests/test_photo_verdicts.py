@@ -151,7 +151,7 @@ def test_a_wrong_size_is_noticed_and_the_tag_is_found_all_the_same(
     assert pose_error(tag.map_from_tag, MAP_FROM_TAG)[0] < 0.01
     assert tag.n_used == 8
     with caplog.at_level(logging.WARNING):
-        warn([tag], [])
+        warn([tag], [], [0])
     assert f"but {SIZE_M * factor:.4g} m is given; measure the black square, or check the map's scale" in caplog.text
 
 
@@ -170,7 +170,7 @@ def test_one_photo_is_allowed_and_says_what_that_means(caplog: pytest.LogCapture
     assert stored.leave_one_out is None
     assert stored.size_from_map is None
     with caplog.at_level(logging.WARNING):
-        warn(solved.tags, [])
+        warn(solved.tags, [], [0] * len(solved.tags))
     assert "tag 0: warn: one photo only: nothing tells whether it is right" in caplog.text
 
 

@@ -7,10 +7,11 @@ import math
 
 import numpy as np
 import pytest
+import scipy.linalg
 from calibration_scenes import aim
 from test_calibrate import SIZE_M, Wall, build, wall_photos
 
-from fieldkit.calibrate.second import SecondLook, compare, look_again
+from fieldkit.calibrate.second import PlacedPhotos, SecondLook, check_in_second_map, compare
 from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, exp, yaw_pose
 from fieldkit.tag_tables import print_second, second_json
@@ -33,9 +34,10 @@ def look(seed: int, *, scale: float = 1.0, noise: float = 1.0, moved: Pose | Non
         there = Pose.from_components(scale * there.translation, there.rotation)
         if moved is not None and i == 5:
             there = there * moved
-        first.append((true * exp(errors[0]), covariance))
-        second.append((there * exp(errors[1]), covariance))
-    return compare(FILES, first, second)
+        first.append(true * exp(errors[0]))
+        second.append(there * exp(errors[1]))
+    every = scipy.linalg.block_diag(*[covariance] * len(FILES))
+    return compare(FILES, PlacedPhotos(tuple(first), every), PlacedPhotos(tuple(second), every))
 
 
 def test_maps_that_agree_pass_whatever_their_frames() -> None:
@@ -61,6 +63,26 @@ def test_a_photo_that_is_wrong_in_one_map_is_named_and_does_not_pull() -> None:
     assert wrong.spread == pytest.approx(right.spread, abs=0.2)
 
 
+def test_what_photos_of_a_map_are_wrong_by_together_does_not_excuse_one_of_them() -> None:
+    rng, n = np.random.default_rng(4), len(FILES)
+    own: Array = np.diag([math.radians(0.1) ** 2] * 3 + [0.004**2] * 3)
+    true = [aim(rng) for _ in range(n)]
+    by_shift = np.concatenate([np.vstack([np.zeros((3, 3)), p.rotation.as_matrix().T]) for p in true])
+    shared = np.kron(np.eye(n), own) + 0.05**2 * by_shift @ by_shift.T
+    quiet = PlacedPhotos(tuple(true), np.kron(np.eye(n), own))
+
+    def shifted(photo: int | None) -> SecondLook:
+        wrong = exp([0.0, 0, 0, 0.04, 0, 0])
+        moved = [p * exp(rng.normal(0, np.sqrt(np.diag(own)))) for p in true]
+        return compare(
+            FILES, quiet, PlacedPhotos(tuple(p * wrong if i == photo else p for i, p in enumerate(moved)), shared)
+        )
+
+    # 4 cm are within the 5 cm that all may be off by together, but not for one photo alone
+    assert [p.file for p in shifted(3).photos if not p.agrees] == ["3.jpg"]
+    assert shifted(None).spread == pytest.approx(1.0, abs=0.35)
+
+
 def test_errors_beyond_their_covariance_fail() -> None:
     assert look(3, noise=4.0).verdict == "fail"
 
@@ -71,7 +93,7 @@ def test_photos_are_compared_with_a_map_of_another_feature(
     second = dataclasses.replace(
         build(wall_photos.texture, np.random.default_rng(7), feature="akaze"), digest="other", path="akaze.map"
     )
-    found = look_again(wall_photos.folder, wall_photos.scene_map, second, sizes_m={None: SIZE_M})
+    found = check_in_second_map(wall_photos.folder, wall_photos.scene_map, second, sizes_m={None: SIZE_M})
     assert found.features == ("sift", "akaze")
     assert found.verdict == "pass"
     assert len([p for p in found.photos if p.agrees]) >= 5
@@ -84,4 +106,4 @@ def test_photos_are_compared_with_a_map_of_another_feature(
 
 def test_the_same_map_is_no_check(wall_photos: Wall) -> None:
     with pytest.raises(TagError, match=r"wall\.map: is the map that is checked; expected another; build one"):
-        look_again(wall_photos.folder, wall_photos.scene_map, wall_photos.scene_map, sizes_m={None: SIZE_M})
+        check_in_second_map(wall_photos.folder, wall_photos.scene_map, wall_photos.scene_map, sizes_m={None: SIZE_M})

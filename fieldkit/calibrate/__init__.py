@@ -7,43 +7,16 @@ from pathlib import Path
 
 from fieldkit.calibrate.locating import locate
 from fieldkit.calibrate.photos import Progress, find_tags, list_photos, parse_sizes
-from fieldkit.calibrate.second import check_in_second_map
+from fieldkit.calibrate.second import check_in_second_map, refuse_same_map
 from fieldkit.calibrate.solving import solve_tags
+from fieldkit.calibrate.starting import Group
 from fieldkit.calibrate.verdicts import photo_verdicts, tag_pose, warn
 from fieldkit.errors import TagError
-from fieldkit.maps import load_map, map_warp
+from fieldkit.maps import map_warp
 from fieldkit.protocol import LocalizerRules
-from fieldkit.types import SceneMap, TagMap
+from fieldkit.types import SceneMap, TagMap, TagPhoto
 
-__all__ = ["calibrate_photos", "calibrate_tags", "check_in_second_map", "parse_sizes"]
-
-
-def calibrate_tags(
-    photos: Path,
-    map_path: Path,
-    *,
-    camera: Path | None = None,
-    sizes_m: Mapping[int | None, float],
-    families: Sequence[str] = ("tag36h11",),
-    detector: str | None = None,
-    rules: LocalizerRules | None = None,
-    progress: Progress | None = None,
-) -> TagMap:
-    """Find map_from_tag of every tag in a folder of photos, in the map in a folder; see `calibrate_photos`.
-
-    Raises also MapError, before any photo is read.
-    """
-    scene_map = load_map(Path(map_path))
-    return calibrate_photos(
-        photos,
-        scene_map,
-        camera=camera,
-        sizes_m=sizes_m,
-        families=families,
-        detector=detector,
-        rules=rules,
-        progress=progress,
-    )
+__all__ = ["calibrate_photos", "check_in_second_map", "parse_sizes", "refuse_same_map"]
 
 
 def calibrate_photos(
@@ -83,7 +56,13 @@ def calibrate_photos(
     warp = map_warp(scene_map)
     solved = solve_tags(located, scene_map.xyz, scene_map.xyz_covariance, sizes_m=sizes_m, warp=warp)
     everything = photo_verdicts(solved, located) + rejected
-    warn(solved.tags, everything)
+    refused = [sum(_is_of(p, t.group) for p in rejected) for t in solved.tags]
+    warn(solved.tags, everything, refused)
     order = {p.file: i for i, p in enumerate(listed)}
     everything.sort(key=lambda p: (order[p.file], p.tag_id))
-    return TagMap(tuple(tag_pose(t) for t in solved.tags), tuple(everything), scene_map.digest)
+    tags = tuple(tag_pose(t, refused=n) for t, n in zip(solved.tags, refused, strict=True))
+    return TagMap(tags, tuple(everything), scene_map.digest)
+
+
+def _is_of(photo: TagPhoto, group: Group) -> bool:
+    return photo.tag_id == group.tag_id and group.visit in (None, photo.visit)

@@ -201,7 +201,12 @@ def find_tags(
         image = read_photo(photo)
         found = [] if image is None else detect(image, photo.camera, families=families, detector=detector)
         if not found:
-            reason = "cannot be read as an image" if image is None else f"no tag found{describe_blur(image)}"
+            if image is not None:
+                reason = f"no tag found{describe_blur(image)}"
+            elif pictures.is_cut_short(photo.path):
+                reason = "the file is cut short; copy it again"
+            else:
+                reason = "cannot be read as an image"
             rejected.append(TagPhoto(photo.file, -1, used=False, reason=reason, visit=photo.visit))
         usable = []
         for d in found:
@@ -214,6 +219,7 @@ def find_tags(
                 usable.append(d)
         if usable:
             shots.append(Shot(photo, tuple(usable), tuple(found)))
+    _check_families(folder, shots)
     if not seen:
         raise TagError(
             f"{folder}: none of the {len(listed)} photos shows a tag of {', '.join(families)} (for example "
@@ -231,6 +237,20 @@ def find_tags(
             f"{folder}: no tag can be used; tags {sorted(seen)} are seen, sizes are given for {_keys(sizes_m)}"
         )
     return shots, rejected
+
+
+def _check_families(folder: Path, shots: Sequence[Shot]) -> None:
+    """Raise TagError where one id is seen in two families: tags.toml, starts and visits name a tag by its id alone."""
+    first: dict[int, tuple[str, str]] = {}
+    for shot in shots:
+        for d in shot.found:
+            family, file = first.setdefault(d.id, (d.family, shot.photo.file))
+            if family != d.family:
+                raise TagError(
+                    f"{folder}: tag {d.id} is of {family} in {file} and of {d.family} in {shot.photo.file}; expected "
+                    "one family per id",
+                    hint="choose one with --family, or print other ids",
+                )
 
 
 def _why_not(

@@ -56,8 +56,11 @@ class PhotoHeader:
 
 def foreign_format(path: Path) -> str | None:
     """Name a photo's format where it is one that is not read, by its first bytes or its suffix."""
-    with path.open("rb") as file:
-        head = file.read(12)
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:
+        return None
     if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
         return "HEIC"
     return FOREIGN_SUFFIXES.get(path.suffix.lower())
@@ -185,11 +188,26 @@ def warn_focal(path: Path, header: PhotoHeader, focal_px: float, camera_path: Pa
         )  # fmt: skip
 
 
+def is_cut_short(path: Path) -> bool:
+    """Tell whether a file begins as a JPEG but has no end of image (ITU T.81, B.2.1) in its last megabyte."""
+    try:
+        with path.open("rb") as file:
+            if file.read(3) != b"\xff\xd8\xff":
+                return False
+            file.seek(max(0, path.stat().st_size - 2**20))
+            return b"\xff\xd9" not in file.read()
+    except OSError:
+        return False
+
+
 def read_grey(path: Path) -> Image | None:
     """Read the stored pixels of a photo as grey uint8[h, w], None where it is no image.
 
-    EXIF's rotation is not applied. Of 16-bit pixels, linear or not, black stays and the brightest become white.
+    EXIF's rotation is not applied. Of 16-bit pixels, linear or not, black stays and the brightest become white. A JPEG
+    that is cut short counts as no image: decoders fill the rest with grey.
     """
+    if is_cut_short(path):
+        return None
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None:
         return None

@@ -267,11 +267,15 @@ def _tag(
     size: SizeCheck,
 ) -> SolvedTag:
     own = [s for s, t in zip(sightings, problem.corners.tag, strict=True) if t == tag]
-    map_from_tag = final.adjusted.state.tags.pose(tag)
+    map_from_tag, covariance = final.adjusted.state.tags.pose(tag), final.adjusted.tag_covariance(tag) * final.inflation
+    if sum(s.used for s in own) == 1 < len(own):
+        # No two photos agree, and nothing tells which one is right
+        apart = np.median([s.offset for s in own if not s.used], axis=0)
+        covariance = covariance + np.diag(np.repeat(apart[::-1] ** 2 / 3, 3))
     return SolvedTag(
         problem.groups[tag],
         map_from_tag,
-        final.adjusted.tag_covariance(tag) * final.inflation,
+        covariance,
         float(np.sqrt(np.mean([s.residual_px**2 for s in own if s.used]))),
         tuple(own),
         size,

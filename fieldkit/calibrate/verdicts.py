@@ -19,10 +19,10 @@ log = logging.getLogger(__name__)
 SHOWN_SIZE_SHARE = 0.1
 
 
-def tag_pose(tag: SolvedTag) -> TagPose:
-    """Return a solved tag as it is stored."""
+def tag_pose(tag: SolvedTag, *, refused: int = 0) -> TagPose:
+    """Return a solved tag as it is stored; ``refused`` photos of it did not come as far as being solved for."""
     group, size = tag.group, tag.size
-    verdict, reason = explained(tag)
+    verdict, reason = explained(tag, refused=refused)
     return TagPose(
         group.tag_id,
         group.family,
@@ -47,8 +47,8 @@ def judge(tag: SolvedTag) -> Verdict:
     return explained(tag)[0]
 
 
-def explained(tag: SolvedTag) -> tuple[Verdict, str]:
-    """Judge a tag, and say what a verdict other than pass rests on."""
+def explained(tag: SolvedTag, *, refused: int = 0) -> tuple[Verdict, str]:
+    """Judge a tag, and say what a verdict other than pass rests on; see `tag_pose`."""
     bounds, used, count = TAG_BOUNDS, tag.n_used, len(tag.sightings)
     off = abs(math.log(tag.size.measured_m / tag.group.size_m))
     fails: list[str] = []
@@ -64,8 +64,8 @@ def explained(tag: SolvedTag) -> tuple[Verdict, str]:
         warns.append("one photo only: nothing tells whether it is right")
     elif 1 < used < bounds.enough_photos:
         warns.append(f"{used} photos only: they cannot outvote a wrong one")
-    if count - used > bounds.rejected_share * count:
-        warns.append(f"{count - used} of {count} photos are rejected")
+    if count + refused - used > bounds.rejected_share * (count + refused):
+        warns.append(f"{count + refused - used} of {count + refused} photos are rejected")
     if not tag.group.fix.is_certain:
         warns.append("its tilt is open: the photos do not decide between two")
     sigma = np.sqrt(np.diag(tag.covariance))
@@ -93,7 +93,7 @@ def photo_verdicts(solved: Solved, photos: Sequence[LocatedPhoto]) -> list[TagPh
                     tag.group.tag_id,
                     used=s.used,
                     reason="" if s.used else explain(s),
-                    visit=tag.group.visit,
+                    visit=s.sighted.visit,
                     ambiguity=s.sighted.solution.ambiguity,
                     sigma=s.sigmas,
                     flipped=s.flipped,
@@ -128,10 +128,10 @@ def explain(sighting: SolvedSighting) -> str:
     return f"disagrees with the others by {where}"
 
 
-def warn(tags: Sequence[SolvedTag], photos: Sequence[TagPhoto]) -> None:
-    """Log what a reader should look at."""
-    for tag in tags:
-        group, size, (verdict, reason) = tag.group, tag.size, explained(tag)
+def warn(tags: Sequence[SolvedTag], photos: Sequence[TagPhoto], refused: Sequence[int]) -> None:
+    """Log what a reader should look at; ``refused`` photos of each tag did not come as far as being solved for."""
+    for tag, n_refused in zip(tags, refused, strict=True):
+        group, size, (verdict, reason) = tag.group, tag.size, explained(tag, refused=n_refused)
         where = "" if group.visit is None else f" of visit {group.visit}"
         if size.is_wrong:
             log.warning(

@@ -56,16 +56,10 @@ class TagSection:
 
 def tag_section(tags: TagMap, *, name: str) -> TagSection:
     """Return what the page shows of the tags of a run; ``name`` is put before the ids of its figures."""
-    own = [photos_of(tags, tag) for tag in tags.tags]
+    own = [tags.photos_of(tag) for tag in tags.tags]
     listed = {id(p) for photos in own for p in photos}
     rows = tuple(_tag(t, photos, f"{name}{i}") for i, (t, photos) in enumerate(zip(tags.tags, own, strict=True)))
     return TagSection(_bounds(), rows, tuple(_photo(p) for p in tags.photos if id(p) not in listed))
-
-
-def photos_of(tags: TagMap, tag: TagPose) -> list[TagPhoto]:
-    """Return the photos of a tag; one that has the same place at every visit has those of every visit."""
-    same = [p for p in tags.photos if p.tag_id == tag.id]
-    return same if tag.visit is None else [p for p in same if p.visit == tag.visit]
 
 
 def _bounds() -> tuple[tuple[str, str], ...]:

@@ -14,18 +14,20 @@ from fieldkit.frames import Array, pose, position_quaternion
 from fieldkit.store.files import digest, read_toml, write_toml
 from fieldkit.types import TagMap, TagPhoto, TagPose
 
+MAX_SIZE_M = 100.0
+
 
 class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     id: int
     family: str
-    size_m: Annotated[float, msgspec.Meta(gt=0)]
+    size_m: Annotated[float, msgspec.Meta(gt=0, le=MAX_SIZE_M)]
     position_m: list[float]
     quaternion_xyzw: list[float]
     covariance: list[float]
     n_photos: int
     rms_px: float
     verdict: Literal["pass", "warn", "fail"]
-    visit: str | None = None
+    visit: Annotated[str, msgspec.Meta(min_length=1)] | None = None
     leave_one_out_m: float | None = None
     leave_one_out_deg: float | None = None
     size_from_map_m: float | None = None

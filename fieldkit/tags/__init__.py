@@ -3,7 +3,7 @@
 from fieldkit.tags.detect import TagDetection, detect
 from fieldkit.tags.detectors import DETECTORS, FoundTag, TagDetector
 from fieldkit.tags.drawing import draw_tag
-from fieldkit.tags.families import FAMILIES
+from fieldkit.tags.families import FAMILIES, check_families
 from fieldkit.tags.fusion import Sighting, TagFix, fuse_sightings
 from fieldkit.tags.pose import TagSolution, solve, tag_corners
 from fieldkit.tags.sightings import BodySighting, BodySightings, Place, body_sightings, frames_between, placed_tags
@@ -24,6 +24,7 @@ __all__ = [
     "TagSolution",
     "body_in_map",
     "body_sightings",
+    "check_families",
     "detect",
     "draw_tag",
     "frames_between",

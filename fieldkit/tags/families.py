@@ -14,6 +14,7 @@ from pupil_apriltags import Detector
 from pupil_apriltags.bindings import _ApriltagFamily
 
 from fieldkit.errors import TagError, suggestion
+from fieldkit.types import TagMap
 
 Bits = NDArray[np.uint8]
 
@@ -89,6 +90,16 @@ def family_struct(family: str) -> Any:
     return create()
 
 
+def check_families(tags: TagMap) -> None:
+    """Raise TagError where a tag is of a family that nothing finds."""
+    for tag in tags.tags:
+        if tag.family not in FAMILIES:
+            raise TagError(
+                f"{tags.path}: tag {tag.id}: unknown tag family {tag.family!r}; expected one of {', '.join(FAMILIES)}",
+                hint=suggestion(tag.family, list(FAMILIES)),
+            )
+
+
 def find_family(name: str) -> Family:
     """Return a family by name. Raises TagError for one that is unknown."""
     if name not in FAMILIES:
@@ -102,7 +113,7 @@ def pattern(family: str, tag_id: int) -> Bits:
     Raises TagError for an unknown family or an id that the family does not have.
     """
     layout = find_family(family)
-    count = _size(family)
+    count = family_size(family)
     if not 0 <= tag_id < count:
         raise TagError(f"{family} has no tag {tag_id}; expected an id in 0..{count - 1}")
     if layout.opencv is None:
@@ -114,7 +125,8 @@ def pattern(family: str, tag_id: int) -> Bits:
 
 
 @functools.lru_cache(maxsize=16)
-def _size(family: str) -> int:
+def family_size(family: str) -> int:
+    """Return the number of a family's tags; ids run from 0."""
     code = FAMILIES[family].opencv
     if code is None:
         return int(family_struct(family).contents.ncodes)

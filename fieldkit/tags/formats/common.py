@@ -16,6 +16,7 @@ from ruamel.yaml.error import YAMLError
 from fieldkit.errors import StoreError, TagError
 from fieldkit.frames import Array, Pose
 from fieldkit.store.files import convert, read_text
+from fieldkit.tags.families import FAMILIES, family_size
 from fieldkit.types import Excluded, TagMap, TagPose
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -23,6 +24,8 @@ T = TypeVar("T", bound=msgspec.Struct)
 # Taken where a file says nothing of its poses' uncertainty: a careful survey with a tape measure
 DEFAULT_SIGMA_M = 0.01
 DEFAULT_SIGMA_DEG = 1.0
+# Beyond this a place is a typing error
+FAR_M = 1e6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,6 +131,13 @@ def _check(path: Path, tag: TagPose) -> None:
             f"{path}: tag {tag.id} has an edge of {tag.size_m:g} m; expected metres, 0.005 to 5",
             hint="correct the file",
         )
+    if tag.family in FAMILIES and not 0 <= tag.id < family_size(tag.family):
+        raise TagError(
+            f"{path}: tag {tag.id}: {tag.family} has the ids 0 to {family_size(tag.family) - 1}",
+            hint="correct the file, or give its family with --family",
+        )
+    if float(np.abs(tag.map_from_tag.translation).max()) > FAR_M:
+        raise TagError(f"{path}: tag {tag.id} is farther than {FAR_M:g} m; expected metres", hint="correct the file")
     if float(np.linalg.eigvalsh(tag.covariance)[0]) <= 0:
         raise TagError(
             f"{path}: tag {tag.id} has no noise along some axis; expected standard deviations above zero",
