@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import re
 import shutil
@@ -23,9 +22,6 @@ from transcode import transcode
 
 from fieldkit import store
 from fieldkit.bags import LAYOUTS, RecordingWriter, open_arm, open_recording
-from fieldkit.bags.content import collect
-from fieldkit.bags.files import BagFile
-from fieldkit.cameras import Camera
 from fieldkit.errors import BagError, StoreError
 from fieldkit.frames import Pose, exp, interpolate, pose, pose_error
 from fieldkit.replay import replay
@@ -54,14 +50,6 @@ class Lab:
         )
 
 
-@functools.cache
-def stated() -> tuple[Camera, Pose]:
-    """Return camera and hand_from_cam as the sample has them."""
-    content = collect(BagFile(SAMPLE / "session" / "robot.mcap"), LAYOUTS["generic"])
-    hand_from_cam = content.tf.lookup("arm_link_wr0", "arm_camera", t_ns=content.images[0].t_ns)
-    return content.cameras[0][1], hand_from_cam
-
-
 def shorten(path: Path, *, late_ns: int = 0) -> Path:
     """Leave few images of the start and few views of the first visit, by a session.toml; return its folder."""
     recording = open_recording(path)
@@ -80,12 +68,15 @@ def shorten(path: Path, *, late_ns: int = 0) -> Path:
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     folder = tmp_path_factory.mktemp("lab")
     source = SAMPLE / "session" / "robot.mcap"
-    camera, hand = stated()
-    longer = Camera("PINHOLE", 640, 480, (1.03 * camera.params[0], 1.03 * camera.params[1], *camera.params[2:]))
     right = transcode(source, folder / "right", "mcap")
+    arm = open_arm(right)
+    camera = arm.frames[0].camera
+    assert arm.kinematics.mount is not None
+    parent, hand = arm.kinematics.mount
+    longer = dataclasses.replace(camera, params=(1.03 * camera.params[0], 1.03 * camera.params[1], *camera.params[2:]))
     wrong = transcode(source, folder / "wrong", "mcap", camera=longer, hand_from_cam=hand * WRONG_HAND, late_ns=LATE_NS)
     store.write_camera(folder / "camera.toml", camera)
-    store.write_hand(folder / "hand.toml", Hand("arm_link_wr0", "arm_camera", hand, latency=(LATE_NS / 1e9, 0.002)))
+    store.write_hand(folder / "hand.toml", Hand(parent, "arm_camera", hand, latency=(LATE_NS / 1e9, 0.002)))
     return Lab(shorten(right), shorten(wrong, late_ns=LATE_NS), folder / "camera.toml", folder / "hand.toml")
 
 
@@ -130,7 +121,7 @@ def test_with_corrections_prior_truth_candidates_and_estimates_are_those_of_a_ri
     assert one == other
     # Whoever joins estimates with images does so by the header stamps
     assert [r.t_ns for r in corrected.results] == [r.t_ns + LATE_NS for r in right.results]
-    assert {p.candidates.camera for p in corrected.plans} == {stated()[0]}
+    assert {p.candidates.camera for p in corrected.plans} == {store.read_camera(lab.camera)}
 
 
 def test_without_corrections_they_are_not(tmp_path: Path, lab: Lab, right: Run) -> None:
