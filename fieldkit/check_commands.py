@@ -62,12 +62,9 @@ def tags_check(
     for path in outputs:
         store.refuse_existing(path, force=force, kind="file")
     loaded = store.read_tags(tags)
-    of_arm = [*outputs, *(path for path in (camera, hand) if path is not None)]
+    of_arm = bool(outputs) or camera is not None or hand is not None
     if recording is None and (of_arm or not distance):
-        raise TagError(
-            f"{tags}: nothing to check{' with' if of_arm else ''}; expected --distance A B METRES or --recording",
-            hint="measure between two tags, or record a sweep of the arm over one",
-        )
+        raise _nothing_to_check(tags, "--recording" if of_arm else "--distance A B METRES or --recording")
     given = store.read_corrections(camera=camera, hand=hand)
     report: dict[str, Any] = {"version": 1}
     verdicts: list[str] = []
@@ -87,6 +84,11 @@ def tags_check(
     if json:
         print_json(report)
     return 3 if "fail" in verdicts else 0
+
+
+def _nothing_to_check(tags: Path, expected: str) -> TagError:
+    hint = "measure between two tags, or record a sweep of the arm over one"
+    return TagError(f"{tags}: nothing to check; expected {expected}", hint=hint)
 
 
 def _check_arm(

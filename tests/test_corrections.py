@@ -25,6 +25,7 @@ from fieldkit.bags import LAYOUTS, RecordingWriter, open_arm, open_recording
 from fieldkit.errors import BagError, StoreError
 from fieldkit.frames import Pose, exp, interpolate, pose, pose_error
 from fieldkit.replay import replay
+from fieldkit.report import write_report
 from fieldkit.store import Corrections, Hand
 from fieldkit.store.inputs import SessionStart, SessionView, SessionVisit
 from fieldkit.types import Run, ViewKind
@@ -133,7 +134,7 @@ def test_without_corrections_they_are_not(tmp_path: Path, lab: Lab, right: Run) 
     assert pose_error(run.plans[0].prior.map_from_body, right.plans[0].prior.map_from_body)[0] > 0.01
 
 
-def test_a_run_says_which_files_were_applied(lab: Lab, right: Run, corrected: Run) -> None:
+def test_run_and_report_say_which_files_were_applied(tmp_path: Path, lab: Lab, right: Run, corrected: Run) -> None:
     folder = lab.right.parent
     told = json.loads((folder / "run_corrected" / "run.json").read_text())["corrections"]
     assert told == [
@@ -142,6 +143,8 @@ def test_a_run_says_which_files_were_applied(lab: Lab, right: Run, corrected: Ru
     ]
     assert store.read_run(folder / "run_corrected").corrections == corrected.corrections
     assert json.loads((folder / "run_right" / "run.json").read_text())["corrections"] == []
+    write_report([corrected], tmp_path / "report.html")
+    assert f"hand: {lab.hand} ({store.digest(lab.hand)})" in (tmp_path / "report.html").read_text()
 
 
 def test_a_replay_that_goes_on_with_other_corrections_takes_no_estimate_over(
@@ -365,7 +368,7 @@ def test_corrections_without_a_recording_are_refused(tmp_path: Path, capsys: pyt
     path = tmp_path / "camera.toml"
     path.write_text(CAMERA_FILE)
     words = ["tags", "check", SAMPLE / "tags.toml", "--camera", path, "--distance", "1", "2", "3.0"]
-    assert "tags.toml: nothing to check with; expected" in fails(capsys, *words)
+    assert "tags.toml: nothing to check; expected --recording; " in fails(capsys, *words)
 
 
 def test_a_hand_that_does_not_carry_the_camera_is_refused(tmp_path: Path) -> None:

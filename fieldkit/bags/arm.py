@@ -78,7 +78,7 @@ def open_arm(
             f"{bag.path}: no layout fits; the bag has {topic_list(bag)}", hint="pass a Layout that names them"
         )
     content = collect(bag, chosen)
-    warnings = correct(bag, content, corrections or Corrections(), layout=chosen)
+    warnings = correct(bag, content, corrections, layout=chosen)
     if content.camera_error is not None:
         raise content.camera_error
     if not content.has_camera:

@@ -13,13 +13,15 @@ from fieldkit.frames import Pose
 from fieldkit.store import Corrections, Hand
 
 
-def correct(bag: BagFile, content: Content, corrections: Corrections, *, layout: Layout) -> list[str]:
+def correct(bag: BagFile, content: Content, corrections: Corrections | None, *, layout: Layout) -> list[str]:
     """Correct the camera, its place in the hand and the latency of stamps in a bag's content; return what to warn of.
 
     Frames, views and detections that are made of it afterwards have the corrected values. Raises BagError where the
     camera has another resolution than the images, or the hand's frames are not those between body and images.
     """
     warnings: list[str] = []
+    if corrections is None:
+        return warnings
     if corrections.hand is not None:
         _correct_hand(bag, content, corrections.hand, corrections.name("hand"), layout=layout)
         content.late_ns = corrections.late_ns

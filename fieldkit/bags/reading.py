@@ -44,8 +44,8 @@ def open_recording(
 
     The layout is the one given, else that of session.toml, else the one that fits the topics. Images stay in the
     bag until a frame's ``read()``. The same content gives the same recording in every format: frames are ordered by
-    header stamp, equal stamps as in the bag. ``corrections`` take the place of the stated camera, of its place in the
-    hand, and of its stamps. Raises BagError for whatever is missing or does not fit, naming topics or frames.
+    header stamp, equal stamps as in the bag. ``corrections`` take the place of what it states of camera, hand and
+    stamps. Raises BagError for whatever is missing or does not fit, naming topics or frames.
     """
     source = open_source(path)
     bag = source.bag
@@ -54,10 +54,9 @@ def open_recording(
         raise BagError(f"{bag.path}: no message in it; expected a recording", hint="record it again")
     if chosen is None:
         raise BagError(_no_layout(bag), hint="remap the topics, or pass a Layout that names them")
-    given = corrections or Corrections()
-    _require_topics(bag, chosen, given)
+    _require_topics(bag, chosen, corrections)
     content = collect(bag, chosen)
-    corrected = correct(bag, content, given, layout=chosen)
+    corrected = correct(bag, content, corrections, layout=chosen)
     _require_content(bag, chosen, content)
     faults = odometry_faults(content)
     marks = find_marks(content.events, source.session, path=bag.path, t_end_ns=content.last_ns)
@@ -216,7 +215,7 @@ def _frozen(visit: Visit, content: Content) -> bool:
     return moved and all(np.allclose(p, poses[0], atol=1e-4) for p in poses)
 
 
-def _require_topics(bag: BagFile, layout: Layout, corrections: Corrections) -> None:
+def _require_topics(bag: BagFile, layout: Layout, corrections: Corrections | None) -> None:
     def count(*topics: str) -> int:
         return sum(bag.topics[t].count for t in topics if t in bag.topics)
 
@@ -228,7 +227,7 @@ def _require_topics(bag: BagFile, layout: Layout, corrections: Corrections) -> N
         "tf": (layout.tf, layout.tf_static),
         "odometry": (layout.odometry,),
     }
-    if corrections.camera is not None:
+    if corrections is not None and corrections.camera is not None:
         del needed["camera_info"]
     for what, topics in needed.items():
         if not count(*topics):
