@@ -357,10 +357,10 @@ def test_a_correction_that_does_not_fit_the_recording_is_one_line(
 
 def test_a_correction_that_does_not_fit_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "camera.toml"
-    path.write_text(CAMERA_FILE)
-    words = [SAMPLE / "session", "--map", SAMPLE / "lab.map", "--tags", SAMPLE / "tags.toml"]
+    path.write_text(CAMERA_FILE.replace("64", "640").replace("48", "480"))
+    words = [write_sample(tmp_path, "mcap"), "--map", SAMPLE / "lab.map", "--tags", SAMPLE / "tags.toml"]
     line = fails(capsys, "replay", *words, "--out", tmp_path / "out" / "run", "--camera", path)
-    assert "camera.toml: is for images of 64x48; expected 640x480" in line
+    assert "camera.toml: is for images of 640x480; expected 64x48" in line
     assert not (tmp_path / "out").exists()
 
 

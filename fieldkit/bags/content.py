@@ -171,7 +171,10 @@ def _camera(bag: BagFile, topic: str, info: Any, cache: dict[tuple[Any, ...], Ca
                 int(info.width), int(info.height), k, list(d), distortion_model=info.distortion_model
             )
         except FieldkitError as error:
-            hint = error.hint or "calibrate the camera, or correct the driver's CameraInfo"
+            hint = (
+                error.hint
+                or "calibrate the camera and give its camera.toml (--camera), or correct the driver's CameraInfo"
+            )
             raise BagError(f"{bag.path}: {topic}: {error.message}", hint=hint) from error
     return cache[key]
 
