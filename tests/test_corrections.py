@@ -6,13 +6,14 @@ import dataclasses
 import json
 import re
 import shutil
+import struct
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from bag_samples import CAMERA, HAND_FROM_CAM, Options, body_from_hand, jpeg, picture, stamp, write_sample
+from bag_samples import CAMERA, HAND_FROM_CAM, Options, body_from_hand, jpeg, picture, rewritten, stamp, write_sample
 from rosbags.typesys.store import Typestore
 from test_bad_input import fails
 from test_detections import OLD_DETECTION, header, ros_pose, with_types
@@ -227,6 +228,13 @@ def test_a_camera_serves_recordings_whose_camera_info_is_unusable_or_missing(tmp
     assert {f.camera for f in open_arm(path, corrections=Corrections(camera=other)).frames} == {other}
     with pytest.raises(BagError, match="no camera_info in layout"):
         open_recording(path, corrections=Corrections(hand=said()))
+    (tmp_path / "other").mkdir()
+    stated, unusable = write_sample(tmp_path / "other", "mcap"), tmp_path / "unusable.mcap"
+    focal = struct.pack("<d", CAMERA.params[0])
+    rewritten(stated, unusable, lambda topic, data: data.replace(focal, bytes(8)) if "info" in topic else data)
+    with pytest.raises(BagError, match=r"/arm_camera/camera_info: .*give its camera\.toml \(--camera\)"):
+        open_recording(unusable)
+    assert {f.camera for f in open_recording(unusable, corrections=Corrections(camera=other)).frames} == {other}
 
 
 def test_recorded_detections_keep_their_pixels_and_get_the_corrected_camera_and_time(tmp_path: Path) -> None:
