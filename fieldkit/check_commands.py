@@ -14,7 +14,8 @@ from fieldkit.console import ProgressBars, cells, make_table, print_json
 from fieldkit.errors import TagError
 
 if TYPE_CHECKING:
-    from fieldkit.checks import ArmCheck, DistanceCheck, ScaleCheck
+    from fieldkit.checks import ArmCheck, DistanceCheck, Refined, ScaleCheck
+    from fieldkit.store import Corrections
     from fieldkit.types import TagMap
 
 # Heavy rooms are imported inside the commands, as in fieldkit.cli
@@ -28,6 +29,8 @@ def tags_check(
     distance: Repeated[tuple[tuple[str, str, float], ...]] = (),
     tape_sigma_m: float = 0.002,
     recording: Path | None = None,
+    camera: Path | None = None,
+    hand: Path | None = None,
     layout: str | None = None,
     size_m: Repeated[tuple[str, ...]] = (),
     sigmas: float = 3.0,
@@ -43,6 +46,8 @@ def tags_check(
         distance: two tags (3, or 3@w02 for its place at a visit) and the metres between their centres; may be repeated
         tape_sigma_m: standard deviation of the tape measure in m
         recording: bag or session folder in which the arm camera sees tags from many poses while the robot stands
+        camera: camera.toml to check in place of what the recording states
+        hand: hand.toml to check in place of what the recording states
         layout: names of topics and frames of the recording; found by itself when not given
         size_m: edge length in m of tags that tags.toml lacks, or ID:SIZE for one tag; may be repeated
         sigmas: a deviation from what is stated counts from so many standard deviations
@@ -59,11 +64,10 @@ def tags_check(
         store.refuse_existing(path, force=force, kind="file")
     loaded = store.read_tags(tags)
     check_families(loaded)
-    if recording is None and (outputs or not distance):
-        raise TagError(
-            f"{tags}: nothing to check{' with' if outputs else ''}; expected --distance A B METRES or --recording",
-            hint="measure between two tags, or record a sweep of the arm over one",
-        )
+    of_arm = bool(outputs) or camera is not None or hand is not None
+    if recording is None and (of_arm or not distance):
+        raise _nothing_to_check(tags, "--recording" if of_arm else "--distance A B METRES or --recording")
+    given = store.read_corrections(camera=camera, hand=hand)
     report: dict[str, Any] = {"version": 1}
     verdicts: list[str] = []
     if distance:
@@ -73,25 +77,38 @@ def tags_check(
         if not json:
             _print_distances(checks, scale)
     if recording is not None:
-        found = _check_arm(loaded, recording, layout=layout, sizes=size_m, sigmas=sigmas)
+        found = _check_arm(loaded, recording, given=given, layout=layout, sizes=size_m, sigmas=sigmas)
         report["arm"] = _arm_json(found)
         verdicts.append(found.verdict)
         if not json:
             _print_arm(found)
-        _refine(found, camera=refine_camera, hand=refine_hand)
+        _refine(found, given, camera=refine_camera, hand=refine_hand)
     if json:
         print_json(report)
     return 3 if "fail" in verdicts else 0
 
 
-def _check_arm(tags: TagMap, recording: Path, *, layout: str | None, sizes: tuple[str, ...], sigmas: float) -> ArmCheck:
+def _nothing_to_check(tags: Path, expected: str) -> TagError:
+    hint = "measure between two tags, or record a sweep of the arm over one"
+    return TagError(f"{tags}: nothing to check; expected {expected}", hint=hint)
+
+
+def _check_arm(
+    tags: TagMap,
+    recording: Path,
+    *,
+    given: Corrections,
+    layout: str | None,
+    sizes: tuple[str, ...],
+    sigmas: float,
+) -> ArmCheck:
     from fieldkit.bags import open_arm
     from fieldkit.calibrate import parse_sizes
     from fieldkit.checks import check_arm, find_sweep
 
     sizes_m: dict[int | None, float] = {t.id: t.size_m for t in tags.tags}
     sizes_m |= parse_sizes(sizes) if sizes else {}
-    opened = open_arm(recording, layout=layout)
+    opened = open_arm(recording, layout=layout, corrections=given)
     for warning in opened.warnings:
         _log.warning("%s: %s", recording, warning)
     with ProgressBars() as progress:
@@ -102,7 +119,7 @@ def _check_arm(tags: TagMap, recording: Path, *, layout: str | None, sizes: tupl
     return check_arm(sweep, sigmas=sigmas)
 
 
-def _refine(found: ArmCheck, *, camera: Path | None, hand: Path | None) -> None:
+def _refine(found: ArmCheck, given: Corrections, *, camera: Path | None, hand: Path | None) -> None:
     """Write what is to be refined; both are fitted before either is written."""
     from fieldkit import store
     from fieldkit.checks import refine_arm
@@ -118,16 +135,25 @@ def _refine(found: ArmCheck, *, camera: Path | None, hand: Path | None) -> None:
     if hand is not None and hands is not None and hands.hand_from_cam is not None:
         kinematics = found.sweep.kinematics
         assert kinematics.mount is not None
-        mount = store.Hand(kinematics.mount[0], kinematics.camera_frame, hands.hand_from_cam, hands.covariance)
-        store.write_hand(hand, mount)
+        frames = (kinematics.mount[0], kinematics.camera_frame)
+        latency = _total_latency(given, hands)
+        store.write_hand(hand, store.Hand(*frames, hands.hand_from_cam, hands.covariance, latency))
         _log.info("wrote %s", hand)
-    for group, given in (("camera", camera), ("hand", hand)):
+    for group, path in (("camera", camera), ("hand", hand)):
         off = [f.name for f in found.findings if f.group == group and f.verdict in ("warn", "fail")]
-        if refined is not None and given is None and off:
+        if refined is not None and path is None and off:
             _log.warning(
                 "%s: %s differs too (%s): what was refined belongs to a refined %s; give --refine-%s, too",
                 found.sweep.path, group, ", ".join(off), group, group,
             )  # fmt: skip
+
+
+def _total_latency(given: Corrections, refined: Refined) -> tuple[float, float] | None:
+    """Return by how much stamps are late in all: what was given, and what was found beyond it, where that is shown."""
+    known = None if given.hand is None else given.hand.latency
+    if refined.latency is None:
+        return known
+    return refined.latency[0] + given.late_ns / 1e9, refined.latency[1]
 
 
 def _print_arm(found: ArmCheck) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -201,6 +201,8 @@ def replay(
     out: Path,
     map: Path | None = None,
     tags: Path | None = None,
+    camera: Path | None = None,
+    hand: Path | None = None,
     protocol: str = "paper_real",
     force: bool = False,
 ) -> int:
@@ -211,6 +213,8 @@ def replay(
         out: run folder to write
         map: map folder of the recordings
         tags: tags.toml; not needed where a reference topic gives start and truth
+        camera: camera.toml to use in place of what the recordings state, as of `tags check --refine-camera`
+        hand: hand.toml to use in place of what the recordings state, as of `tags check --refine-hand`
         protocol: name of a protocol, or a .toml file
         force: replace an existing run
     """
@@ -219,7 +223,8 @@ def replay(
 
     rules = protocols.load(protocol)
     sets = [r for r in recordings if is_dataset(r)]
-    _refuse_mixture(recordings, sets, map=map, tags=tags)
+    theirs = {"--map": map, "--tags": tags, "--camera": camera, "--hand": hand}
+    _refuse_mixture(recordings, sets, {name: path for name, path in theirs.items() if path is not None})
     with ProgressBars() as progress:
         if sets:
             from fieldkit.dataset import replay_datasets
@@ -230,22 +235,33 @@ def replay(
 
             assert map is not None
             run = replay_recordings(
-                recordings, map_path=map, tags_path=tags, protocol=rules, out=out, force=force, progress=progress
+                recordings,
+                map_path=map,
+                tags_path=tags,
+                camera_path=camera,
+                hand_path=hand,
+                protocol=rules,
+                out=out,
+                force=force,
+                progress=progress,
             )
     _print_recall(run, preset=None)
     return _missed_bounds(run)
 
 
-def _refuse_mixture(recordings: Sequence[Path], sets: Sequence[Path], *, map: Path | None, tags: Path | None) -> None:
+def _refuse_mixture(recordings: Sequence[Path], sets: Sequence[Path], given: Mapping[str, Path]) -> None:
     """Raise ReplayError where one does not exist, recordings lack a map, or datasets come with what is not theirs."""
     missing = next((r for r in recordings if not r.exists()), None)
     if missing is not None:
         raise ReplayError(f"{missing}: no such file; expected a recording or a dataset", hint="check the path")
     other = next((r for r in recordings if r not in sets), None)
-    if sets and (other is not None or map is not None or tags is not None):
-        what = f"{other} is none" if other is not None else "--map or --tags is given, too"
-        raise ReplayError(f"{sets[0]}: is a dataset; {what}", hint="replay datasets alone: they hold their own maps")
-    if not sets and map is None:
+    if sets and (other is not None or given):
+        what = f"{other} is none" if other is not None else f"{' and '.join(given)} given, too"
+        hint = "replay datasets alone: they hold their own maps, cameras and poses"
+        raise ReplayError(
+            f"{sets[0]}: is a dataset; {what}; expected datasets only, without options of recordings", hint=hint
+        )
+    if not sets and "--map" not in given:
         raise ReplayError(f"{other}: no map was given; expected --map with the map of its scene", hint="give --map")
 
 

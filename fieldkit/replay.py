@@ -27,6 +27,7 @@ from fieldkit.tags import check_families
 from fieldkit.trust import trust
 from fieldkit.truth import estimate_truths
 from fieldkit.types import (
+    Applied,
     Candidates,
     Estimate,
     Excluded,
@@ -71,13 +72,16 @@ def replay(
     protocol: Protocol,
     out: Path,
     tags_path: Path | None = None,
+    camera_path: Path | None = None,
+    hand_path: Path | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Run:
     """Replay recordings through every policy of a protocol and write the run folder ``out``.
 
-    Views are localized once and kept in a cache beside ``out`` until the run is complete, so that a second start
-    after a kill resumes. Raises FieldkitError where map, tags, recordings and protocol do not fit together; a visit
+    camera.toml and hand.toml, where given, take the place of what every recording states of its camera. Views are
+    localized once and kept in a cache beside ``out`` until the run is complete, so that a second start after a kill
+    resumes. Raises FieldkitError where map, tags, corrections, recordings and protocol do not fit together; a visit
     without prior, truth or candidates is excluded with its reason, and so is a view without truth or odometry.
     """
     store.refuse_existing(Path(out), force=force, marker="run.json")
@@ -86,14 +90,20 @@ def replay(
             policies.available(name)
     if not recordings:
         raise ReplayError("no recording given; expected at least one", hint="name a bag or a session folder")
+    given = store.read_corrections(camera=camera_path, hand=hand_path)
     scene_map = maps.load_map(map_path)
     policies.check_map(scene_map, protocol)
     tags = _load_tags(tags_path, scene_map)
     cache = store.EstimateCache(Path(out).parent / f".{Path(out).name}.estimates.jsonl")
-    opened = [open_recording(path) for path in recordings]
+    opened = [open_recording(path, corrections=given) for path in recordings]
     _check_names(opened)
-    sessions = [_replay_session(r, scene_map, tags, protocol, cache=cache, progress=progress) for r in opened]
-    run = _collect(opened, sessions, scene_map=scene_map, tags=tags, protocol=protocol)
+    for file in given.applied:
+        log.info("%s takes the place of what the recordings state of the %s", file.path, file.kind)
+    sessions = [
+        _replay_session(r, scene_map, tags, protocol, applied=given.applied, cache=cache, progress=progress)
+        for r in opened
+    ]
+    run = _collect(opened, sessions, scene_map=scene_map, tags=tags, applied=given.applied, protocol=protocol)
     if not run.trials:
         reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3]) or "there is no visit"
         raise ReplayError(f"{recordings[0]}: no visit could be scored: {reasons}", hint="see the reasons")
@@ -170,6 +180,7 @@ def _replay_session(
     tags: TagMap,
     protocol: Protocol,
     *,
+    applied: Sequence[Applied],
     cache: store.EstimateCache,
     progress: Progress | None,
 ) -> _Session:
@@ -199,7 +210,7 @@ def _replay_session(
                 chosen,
                 known.truths,
                 protocol,
-                map_digest=scene_map.digest,
+                made_of=(scene_map.digest, *(file.digest for file in applied)),
                 localizer=localizer,
                 cache=cache,
             )
@@ -279,17 +290,17 @@ def _score_visit(
     truths: Mapping[str, Truth],
     protocol: Protocol,
     *,
-    map_digest: str,
+    made_of: Sequence[str],
     localizer: Localizer,
     cache: store.EstimateCache,
 ) -> _Session:
     results: dict[str, ViewResult] = {}
     thumbnails: dict[str, bytes] = {}
-    settings = repr((map_digest, protocol.feature, protocol.localizer, protocol.seed, store.library_versions()))
+    settings = repr((*made_of, protocol.feature, protocol.localizer, protocol.seed, store.library_versions()))
     for view in views.values():
         image = view.frame.read()
         estimate = _localize_once(image, view, localizer, cache=cache, settings=settings)
-        results[view.id] = ViewResult(plan.session, plan.prior.visit, view.id, view.kind, view.frame.t_ns, estimate)
+        results[view.id] = ViewResult(plan.session, plan.prior.visit, view.id, view.kind, view.frame.stamp_ns, estimate)
         thumbnails[f"{plan.session}/{plan.prior.visit}/{view.id}"] = _thumbnail(image)
     trials = scores.make_trials(plan, results, truths, protocol=protocol)
     return _Session(trials, tuple(results.values()), tuple(truths.values()), (plan,), thumbnails)
@@ -321,6 +332,7 @@ def _collect(
     *,
     scene_map: SceneMap,
     tags: TagMap,
+    applied: tuple[Applied, ...],
     protocol: Protocol,
 ) -> Run:
     return Run(
@@ -339,4 +351,5 @@ def _collect(
         thumbnails={k: v for s in sessions for k, v in s.thumbnails.items()},
         excluded=tuple(e for s in sessions for e in s.excluded),
         tags=tags if tags.tags else None,
+        corrections=applied,
     )

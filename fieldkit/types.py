@@ -37,10 +37,11 @@ class SeenTag:
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """One image of the robot's arm camera: header stamp, camera, kinematics, and the image read on demand.
+    """One image of the robot's arm camera: when it was taken, camera, kinematics, and the image read on demand.
 
-    ``read()`` returns uint8[h, w] (grey) or uint8[h, w, 3] (RGB). ``body_from_cam`` is None where tf does not reach.
-    ``tags`` are those that were detected while recording; None where the image itself is to be searched.
+    ``t_ns`` is the header stamp less the known latency ``late_ns``. ``read()`` returns uint8[h, w] (grey) or
+    uint8[h, w, 3] (RGB). ``body_from_cam`` is None where tf does not reach, ``tags`` (found while recording) where
+    the image itself is to be searched.
     """
 
     t_ns: int
@@ -48,6 +49,12 @@ class Frame:
     body_from_cam: Pose | None
     read: Callable[[], Image]
     tags: tuple[SeenTag, ...] | None = None
+    late_ns: int = 0
+
+    @property
+    def stamp_ns(self) -> int:
+        """The header stamp."""
+        return self.t_ns + self.late_ns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,8 +113,7 @@ class Recording:
     ``frames`` all images of the arm camera in the order of their stamps. ``odometry`` is odom_from_body.
     ``reference`` is map_from_body from a pose topic (motion capture, total station, another system) or None, and
     ``reference_covariance`` f64[n, 6, 6] what the topic says of its samples (right perturbation) or None.
-    ``tag_frames`` are messages of tag detections, frames without an image. ``odometry_faults`` say what is wrong with
-    odometry, and when.
+    ``tag_frames`` are recorded tag detections, frames without an image; ``odometry_faults`` what is wrong, and when.
     """
 
     name: str
@@ -414,6 +420,15 @@ class Excluded:
 
 
 @dataclasses.dataclass(frozen=True)
+class Applied:
+    """A file whose values took the place of what recordings state, and its digest."""
+
+    kind: Literal["camera", "hand"]
+    path: str
+    digest: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Run:
     """A finished replay: everything that scoring and the report need, without images, bag or map.
 
@@ -436,3 +451,4 @@ class Run:
     excluded: tuple[Excluded, ...] = ()
     path: str = ""
     tags: TagMap | None = None
+    corrections: tuple[Applied, ...] = ()

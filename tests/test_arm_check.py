@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -142,6 +143,32 @@ def test_the_command_says_what_is_wrong_and_writes_what_it_found(
     assert read_camera(tmp_path / "camera.toml").focal_px == pytest.approx(robot.ARM_CAMERA.focal_px, rel=0.01)
     hand = read_hand(tmp_path / "hand.toml")
     assert (hand.parent, hand.child) == ("arm_link_wr1", "arm_camera")
+    assert hand.latency is not None
+    late_s, sigma_s = hand.latency
+    assert abs(late_s - WRONG.late_ns / 1e9) < 3.5 * sigma_s
+    with pytest.raises(SystemExit) as stop:
+        main(
+            [str(w) for w in (*words, "--camera", out[1], "--hand", out[3], "--refine-hand", tmp_path / "second.toml")]
+        )
+    again = json.loads(capsys.readouterr().out)["arm"]
+    assert stop.value.code == 0
+    assert again["rms_px"]["stated"] < 1.0 < said["rms_px"]["stated"]
+    assert {f["verdict"] for f in again["findings"] if f["of"] != "tags"} <= {"pass", "unknown"}
+    # What is found beyond what was given adds up
+    second = read_hand(tmp_path / "second.toml")
+    assert second.latency is not None
+    assert second.latency[0] == pytest.approx(late_s, abs=sigma_s)
+    assert pose_error(second.hand_from_cam, hand.hand_from_cam)[0] < 0.002
+
+
+def test_an_arm_that_showed_no_latency_leaves_none_in_the_file(wrong: ArmCheck) -> None:
+    late = refine_arm(wrong, what="hand").latency
+    assert late is not None
+    number = [p.name for p in wrong.fit.parameters].index("stamps late by")
+    covariance = wrong.fit.covariance.copy()
+    covariance[number, number] = (2 * wrong.fit.parameters[number].tolerance) ** 2
+    vague = dataclasses.replace(wrong, fit=dataclasses.replace(wrong.fit, covariance=covariance))
+    assert refine_arm(vague, what="hand").latency is None
 
 
 def test_a_recording_without_tags_kinematics_or_sizes_is_named(tmp_path: Path, recording: Path) -> None:

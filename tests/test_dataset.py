@@ -238,7 +238,8 @@ def test_an_unfinished_or_otherwise_localized_dataset_is_not_replayed(whole: Pat
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--map", "lab.map"], "is a dataset; --map or --tags is given, too"),
+        (["--map", "lab.map"], "is a dataset; --map given, too; expected datasets only"),
+        (["--camera", "camera.toml", "--hand", "hand.toml"], "is a dataset; --camera and --hand given, too; expected"),
         ([__file__], "test_dataset.py is none"),
     ],
 )

@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from fieldkit.bags import LAYOUTS, BagFormat, Layout, RecordingWriter
-from fieldkit.cameras import camera_from_info
+from fieldkit.cameras import Camera, camera_from_info
 from fieldkit.frames import Pose, pose
 
 NAMES: dict[BagFormat, str] = {"mcap": "robot.mcap", "ros1": "robot.bag", "ros2": "robot"}
@@ -33,8 +33,14 @@ def transcode(
     without: Collection[str] = (),
     n_visits: int = 1,
     layout: str = "generic",
+    camera: Camera | None = None,
+    hand_from_cam: Pose | None = None,
+    late_ns: int = 0,
 ) -> Path:
-    """Copy a generic recording up to the end of its n-th visit; ``without`` names parts to leave out."""
+    """Copy a generic recording up to the end of its n-th visit; ``without`` names parts to leave out.
+
+    The copy states ``camera`` and ``hand_from_cam`` where they are given, and stamps images later by ``late_ns``.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     path, ended = folder / NAMES[format], 0
     with RecordingWriter(path, format=format, layout=layout) as writer:
@@ -45,20 +51,26 @@ def transcode(
                     break
                 continue
             if part == "image":
-                writer.image(t_ns, bytes(message.data))
+                writer.image(t_ns + late_ns, bytes(message.data))
             elif part == "camera_info":
                 model = message.distortion_model
-                camera = camera_from_info(message.width, message.height, message.k, message.d, distortion_model=model)
-                writer.camera_info(t_ns, camera)
+                told = camera_from_info(message.width, message.height, message.k, message.d, distortion_model=model)
+                writer.camera_info(t_ns + late_ns, camera or told)
             elif part == "odometry":
                 writer.odometry(t_ns, _pose(message.pose.pose.position, message.pose.pose.orientation))
             elif part == "tf":
                 writer.tf(t_ns, _transforms(message, writer.layout))
             elif part == "tf_static":
-                writer.tf_static(_transforms(message, writer.layout))
+                rows = _transforms(message, writer.layout)
+                if hand_from_cam is not None:
+                    own = writer.layout.camera_frame
+                    rows = [(a, b, hand_from_cam if b == own else a_from_b) for a, b, a_from_b in rows]
+                writer.tf_static(rows)
             else:
                 event = json.loads(message.data)
-                writer.event(t_ns, event)
+                # A view is announced with the stamp of its image
+                late = late_ns if event["event"] == "view" else 0
+                writer.event(t_ns + late, event | {"t_ns": t_ns + late})
                 ended += event["event"] == "visit_end"
                 if ended == n_visits:
                     break

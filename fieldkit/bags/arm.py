@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.bags.content import Content, collect
+from fieldkit.bags.correcting import correct
 from fieldkit.bags.layouts import Layout
 from fieldkit.bags.reading import choose_layout, general_warnings, make_frames, open_source, topic_list
+from fieldkit.bags.tagged import tag_frames
 from fieldkit.bags.tf import TfBuffer
-from fieldkit.cameras import Camera
 from fieldkit.errors import BagError, FrameError
 from fieldkit.frames import Pose, Trajectory
+from fieldkit.store import Corrections
 from fieldkit.types import Frame
 
 Mask = NDArray[np.bool_]
@@ -49,24 +51,25 @@ class Kinematics:
 
 @dataclasses.dataclass(frozen=True)
 class ArmRecording:
-    """Images of the arm camera, its calibrations, both in the order of stamps, kinematics, and odometry if any."""
+    """Frames of the arm camera in the order of stamps, kinematics, and odometry if any.
+
+    ``frames`` are images, or the messages of a detector on the robot where there is no image.
+    """
 
     path: str
     frames: tuple[Frame, ...]
-    cameras: tuple[tuple[int, Camera], ...]
     kinematics: Kinematics
     odometry: Trajectory | None
     warnings: tuple[str, ...]
 
-    def camera_at(self, t_ns: int) -> Camera:
-        """Return the calibration whose stamp is nearest."""
-        return min(self.cameras, key=lambda item: abs(item[0] - t_ns))[1]
 
-
-def open_arm(path: Path | str, *, layout: str | Layout | None = None) -> ArmRecording:
+def open_arm(
+    path: Path | str, *, layout: str | Layout | None = None, corrections: Corrections | None = None
+) -> ArmRecording:
     """Read the images and the kinematics of a recording, whatever waypoints it has; images stay in the bag.
 
-    Raises BagError where the camera's calibration or the transforms from body to camera are missing.
+    ``corrections`` take the place of the stated camera, of its place in the hand, and of its stamps. Raises BagError
+    where the camera's calibration or the transforms from body to camera are missing, or corrections do not fit.
     """
     source = open_source(path)
     bag, chosen = source.bag, choose_layout(source, layout=layout)
@@ -75,9 +78,10 @@ def open_arm(path: Path | str, *, layout: str | Layout | None = None) -> ArmReco
             f"{bag.path}: no layout fits; the bag has {topic_list(bag)}", hint="pass a Layout that names them"
         )
     content = collect(bag, chosen)
+    warnings = correct(bag, content, corrections, layout=chosen)
     if content.camera_error is not None:
         raise content.camera_error
-    if not content.cameras:
+    if not content.has_camera:
         raise BagError(
             f"{bag.path}: no camera_info in layout {chosen.name!r}; expected messages on {chosen.camera_info}",
             hint="record the topic",
@@ -88,8 +92,11 @@ def open_arm(path: Path | str, *, layout: str | Layout | None = None) -> ArmReco
     body = chosen.body_frame if odometry is None else odometry.child
     frames, _ = make_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=body)
     kinematics = _kinematics(bag.path, content, body=body, camera=_camera_frame(content, chosen))
-    warnings = general_warnings(bag, content, 0 if odometry is None else repeated)
-    return ArmRecording(str(path), frames, tuple(content.cameras), kinematics, odometry, tuple(warnings))
+    warnings += general_warnings(bag, content, 0 if odometry is None else repeated)
+    if not frames:
+        frames, notes = tag_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=body)
+        warnings += notes
+    return ArmRecording(str(path), frames, kinematics, odometry, tuple(warnings))
 
 
 def _camera_frame(content: Content, layout: Layout) -> str:
@@ -98,7 +105,7 @@ def _camera_frame(content: Content, layout: Layout) -> str:
 
 
 def _kinematics(path: Path, content: Content, *, body: str, camera: str) -> Kinematics:
-    t_ns = content.images[len(content.images) // 2].t_ns if content.images else content.cameras[0][0]
+    t_ns = content.images[len(content.images) // 2].t_ns if content.images else content.last_ns
     try:
         steps = content.tf.chain(body, camera, t_ns=t_ns)
     except FrameError as error:

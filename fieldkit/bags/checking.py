@@ -13,7 +13,7 @@ from fieldkit.types import OdometryFault
 def odometry_faults(content: Content, samples: PoseSamples | None = None) -> tuple[OdometryFault, ...]:
     """Find the faults of a recording's odometry, or of other samples; the images' times of arrival are the measure."""
     used = content.odometry if samples is None else samples
-    lags = [image.place.log_ns - image.t_ns for image in content.images]
+    lags = [image.place.log_ns - image.t_ns + content.late_ns for image in content.images]
     return find_faults(
         np.array([t for t, _ in used.samples], dtype=np.int64),
         [p for _, p in used.samples],

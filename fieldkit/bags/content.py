@@ -70,7 +70,10 @@ class PoseSamples:
 
 @dataclasses.dataclass
 class Content:
-    """What one pass over a bag found on the topics of a layout."""
+    """What one pass over a bag found on the topics of a layout.
+
+    ``corrected`` takes the place of the stated ``cameras``; the images' stamps are known to be late by ``late_ns``.
+    """
 
     image_topic: str
     images: list[ImagePlace] = dataclasses.field(default_factory=list)
@@ -83,9 +86,20 @@ class Content:
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
     last_ns: int = 0
     camera_error: BagError | None = None
+    corrected: Camera | None = None
+    late_ns: int = 0
 
-    def camera_at(self, t_ns: int) -> Camera:
-        """Return the calibration whose stamp is nearest; the later one when two are equally near."""
+    @property
+    def has_camera(self) -> bool:
+        """Whether anything says how the camera is calibrated."""
+        return bool(self.cameras) or self.corrected is not None
+
+    def camera_at(self, stamp_ns: int) -> Camera:
+        """Return the calibration of the image with a stamp: the corrected one, else the one that is stated."""
+        return self.stated_at(stamp_ns) if self.corrected is None else self.corrected
+
+    def stated_at(self, t_ns: int) -> Camera:
+        """Return the stated calibration whose stamp is nearest; the later one when two are equally near."""
         right = bisect.bisect_left(self.cameras, t_ns, key=lambda item: item[0])
         near = self.cameras[max(right - 1, 0) : right + 1]
         return min(reversed(near), key=lambda item: abs(item[0] - t_ns))[1]
@@ -157,7 +171,10 @@ def _camera(bag: BagFile, topic: str, info: Any, cache: dict[tuple[Any, ...], Ca
                 int(info.width), int(info.height), k, list(d), distortion_model=info.distortion_model
             )
         except FieldkitError as error:
-            hint = error.hint or "calibrate the camera, or correct the driver's CameraInfo"
+            hint = (
+                error.hint
+                or "calibrate the camera and give its camera.toml (--camera), or correct the driver's CameraInfo"
+            )
             raise BagError(f"{bag.path}: {topic}: {error.message}", hint=hint) from error
     return cache[key]
 

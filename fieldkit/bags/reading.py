@@ -11,6 +11,7 @@ import numpy as np
 
 from fieldkit.bags.checking import odometry_faults
 from fieldkit.bags.content import Content, collect
+from fieldkit.bags.correcting import correct
 from fieldkit.bags.events import Marks, ViewMark, find_marks
 from fieldkit.bags.files import BagFile, Place
 from fieldkit.bags.images import decode_image
@@ -20,7 +21,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import BagError, FrameError
 from fieldkit.frames import Pose, Trajectory
 from fieldkit.odometry import summarize_faults
-from fieldkit.store import SessionFile, read_session
+from fieldkit.store import Corrections, SessionFile, read_session
 from fieldkit.types import Frame, Image, Recording, View, Visit
 
 NEAREST_NS = 50_000_000
@@ -36,12 +37,15 @@ class Source:
     name: str
 
 
-def open_recording(path: Path | str, *, layout: str | Layout | None = None) -> Recording:
+def open_recording(
+    path: Path | str, *, layout: str | Layout | None = None, corrections: Corrections | None = None
+) -> Recording:
     """Read a recording: .bag, .mcap, a ROS 2 folder, or a folder whose session.toml names one of these.
 
     The layout is the one given, else that of session.toml, else the one that fits the topics. Images stay in the
     bag until a frame's ``read()``. The same content gives the same recording in every format: frames are ordered by
-    header stamp, equal stamps as in the bag. Raises BagError for whatever is missing, naming topics or frames.
+    header stamp, equal stamps as in the bag. ``corrections`` take the place of what it states of camera, hand and
+    stamps. Raises BagError for whatever is missing or does not fit, naming topics or frames.
     """
     source = open_source(path)
     bag = source.bag
@@ -50,8 +54,9 @@ def open_recording(path: Path | str, *, layout: str | Layout | None = None) -> R
         raise BagError(f"{bag.path}: no message in it; expected a recording", hint="record it again")
     if chosen is None:
         raise BagError(_no_layout(bag), hint="remap the topics, or pass a Layout that names them")
-    _require_topics(bag, chosen)
+    _require_topics(bag, chosen, corrections)
     content = collect(bag, chosen)
+    corrected = correct(bag, content, corrections, layout=chosen)
     _require_content(bag, chosen, content)
     faults = odometry_faults(content)
     marks = find_marks(content.events, source.session, path=bag.path, t_end_ns=content.last_ns)
@@ -67,7 +72,8 @@ def open_recording(path: Path | str, *, layout: str | Layout | None = None) -> R
     visits, notes = join_views(bag.path, marks, frames or tagged)
     _require_tf(bag.path, visits, content, unreached)
     check_sizes(bag, content, frames)
-    warnings = [*general_warnings(bag, content, repeated), *marks.warnings, *notes, *_tf_warnings(frames, unreached)]
+    warnings = [*general_warnings(bag, content, repeated), *corrected, *marks.warnings, *notes]
+    warnings += _tf_warnings(frames, unreached)
     warnings += [*session_warnings(visits, odometry, content), *tag_notes, *summarize_faults(faults)]
     return Recording(
         name=source.name,
@@ -125,7 +131,7 @@ def make_frames(
         by_frame.setdefault(image.frame or camera_frame, []).append(index)
     reached: dict[int, Pose | FrameError] = {}
     for name, indices in by_frame.items():
-        stamps = [content.images[i].t_ns for i in indices]
+        stamps = [content.images[i].t_ns - content.late_ns for i in indices]
         reached |= zip(indices, content.tf.lookup_all(body_frame, name, t_ns=stamps), strict=True)
     frames, unreached = [], []
     for index, image in enumerate(content.images):
@@ -133,7 +139,8 @@ def make_frames(
         if isinstance(found, FrameError):
             unreached.append(found.message)
         read = functools.partial(read_image, bag, image.place, camera)
-        frames.append(Frame(image.t_ns, camera, None if isinstance(found, FrameError) else found, read))
+        body_from_cam, late_ns = None if isinstance(found, FrameError) else found, content.late_ns
+        frames.append(Frame(image.t_ns - late_ns, camera, body_from_cam, read, late_ns=late_ns))
     return tuple(frames), unreached
 
 
@@ -208,7 +215,7 @@ def _frozen(visit: Visit, content: Content) -> bool:
     return moved and all(np.allclose(p, poses[0], atol=1e-4) for p in poses)
 
 
-def _require_topics(bag: BagFile, layout: Layout) -> None:
+def _require_topics(bag: BagFile, layout: Layout, corrections: Corrections | None) -> None:
     def count(*topics: str) -> int:
         return sum(bag.topics[t].count for t in topics if t in bag.topics)
 
@@ -220,6 +227,8 @@ def _require_topics(bag: BagFile, layout: Layout) -> None:
         "tf": (layout.tf, layout.tf_static),
         "odometry": (layout.odometry,),
     }
+    if corrections is not None and corrections.camera is not None:
+        del needed["camera_info"]
     for what, topics in needed.items():
         if not count(*topics):
             raise BagError(
@@ -231,7 +240,7 @@ def _require_topics(bag: BagFile, layout: Layout) -> None:
 def _require_content(bag: BagFile, layout: Layout, content: Content) -> None:
     found: dict[str, tuple[object, str, str]] = {
         "image": (content.images or detection_topics(bag), content.image_topic, "sensor_msgs/Image or CompressedImage"),
-        "camera_info": (content.cameras, layout.camera_info, "sensor_msgs/CameraInfo"),
+        "camera_info": (content.has_camera, layout.camera_info, "sensor_msgs/CameraInfo"),
         "tf": (content.tf.frames, f"{layout.tf} or {layout.tf_static}", "tf2_msgs/TFMessage"),
         "odometry": (content.odometry.samples, layout.odometry, "nav_msgs/Odometry with finite poses"),
     }
@@ -256,7 +265,7 @@ def _require_tf(path: Path, visits: Sequence[Visit], content: Content, unreached
 
 def join_views(path: Path, marks: Marks, frames: Sequence[Frame]) -> tuple[tuple[Visit, ...], list[str]]:
     """Join every view with the image of its stamp, or the nearest; also return notes on those that were only near."""
-    stamps = np.array([f.t_ns for f in frames], dtype=np.int64)
+    stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
     views: dict[str, list[View]] = {mark.id: [] for mark in marks.visits}
     notes = []
     for mark in marks.views:

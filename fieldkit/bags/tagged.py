@@ -32,10 +32,11 @@ def tag_frames(
     """Return a frame per message of tag detections by the arm camera, in the order of stamps, and notes.
 
     Messages of another camera's frame are left out and counted, for their calibration is not known, and so are tags
-    with more than one corrected bit. ``read()`` of such a frame raises BagError.
+    with more than one corrected bit. Where a message has poses alone, their pixels are those of the camera that the
+    recording states: it served the detector. ``read()`` of such a frame raises BagError.
     """
     topics = detection_topics(bag)
-    if not topics or not content.cameras:
+    if not topics or not content.has_camera:
         return (), []
     own = {camera_frame, *(image.frame for image in content.images if image.frame)}
     found: list[tuple[int, str, list[RecordedTag]]] = []
@@ -52,12 +53,13 @@ def tag_frames(
     notes += [f"tag detections: {n} {what} were skipped" for what, n in sorted(refused.items())]
     found.sort(key=lambda item: item[0])
     frames = []
-    for t_ns, name, tags in found:
-        camera = content.camera_at(t_ns)
+    for stamp, name, tags in found:
+        camera, t_ns = content.camera_at(stamp), stamp - content.late_ns
         reached = content.tf.lookup_all(body_frame, name, t_ns=[t_ns])[0]
         body_from_cam = None if isinstance(reached, FrameError) else reached
-        read = functools.partial(_no_image, bag.path, t_ns)
-        frames.append(Frame(t_ns, camera, body_from_cam, read, _seen(tags, camera)))
+        read = functools.partial(_no_image, bag.path, stamp)
+        seen = _seen(tags, content.stated_at(stamp) if content.cameras else camera)
+        frames.append(Frame(t_ns, camera, body_from_cam, read, seen, content.late_ns))
     return tuple(frames), notes
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import FrameError
-from fieldkit.frames import Pose
+from fieldkit.frames import Pose, position_quaternion
 
 
 def clean_frame(name: str) -> str:
@@ -70,6 +70,12 @@ class TfBuffer:
         if above not in tracks:
             tracks[above] = _Track()
         tracks[above].add(t_ns, row)
+
+    def replace_static(self, a: str, b: str, a_from_b: Pose) -> None:
+        """Replace the fixed transform between two neighbouring frames, whichever of them hangs below the other."""
+        below = a if self._static.get(a, ("",))[0] == b else b
+        above, placed = (a, a_from_b) if below == b else (b, a_from_b.inv())
+        self.add_static(above, below, *position_quaternion(placed))
 
     def lookup(self, target: str, source: str, *, t_ns: int) -> Pose:
         """Return target_from_source at a time, interpolated between samples.

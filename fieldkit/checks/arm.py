@@ -10,7 +10,7 @@ import numpy as np
 from fieldkit.cameras import Camera
 from fieldkit.checks.handeye import SweepFit, fit_sweep
 from fieldkit.checks.parameters import changed, refinable
-from fieldkit.checks.sweep_problem import CAMERA, HAND
+from fieldkit.checks.sweep_problem import CAMERA, HAND, LATENCY
 from fieldkit.checks.sweeps import Sweep
 from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, exp
@@ -63,7 +63,8 @@ class Refined:
     """Camera and hand_from_cam as the sweep shows them, hand_from_cam with its 6x6 covariance.
 
     ``kept`` names what keeps its stated value, since the sweep does not show it. ``hand_from_cam`` is None where tf
-    has no fixed transform to the camera.
+    has no fixed transform to the camera. ``latency`` is by how much (s) stamps are late, and its sigma; None where the
+    sweep does not show it.
     """
 
     camera: Camera
@@ -71,6 +72,7 @@ class Refined:
     covariance: Array
     rms_px: float
     kept: tuple[str, ...]
+    latency: tuple[float, float] | None = None
 
 
 def check_arm(sweep: Sweep, *, sigmas: float = SIGMAS) -> ArmCheck:
@@ -130,7 +132,9 @@ def refine_arm(check: ArmCheck, *, what: Literal["camera", "hand"]) -> Refined:
     camera = changed(refinable(check.sweep.camera), fit.values[CAMERA])
     names = tuple(fit.parameters[i].name for i in sorted(kept))
     hand = None if mount is None else mount[1] * exp(fit.values[HAND])
-    return Refined(camera, hand, fit.covariance[HAND, HAND], fit.rms_px[1], names)
+    late = (float(fit.values[LATENCY]), fit.sigma(LATENCY))
+    shown = late if late[1] <= fit.parameters[LATENCY].tolerance else None
+    return Refined(camera, hand, fit.covariance[HAND, HAND], fit.rms_px[1], names, shown)
 
 
 def _what_shows(fit: SweepFit) -> tuple[frozenset[int], Array]:

@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.bags import ArmRecording, Kinematics, read_detections
+from fieldkit.bags import ArmRecording, Kinematics
 from fieldkit.cameras import Camera
 from fieldkit.errors import FrameError, TagError
 from fieldkit.frames import Array, Pose, Trajectory, pose_error
 from fieldkit.tags import TagDetection, detect
 from fieldkit.tags.detect import COARSE_SIGMA_PX
-from fieldkit.types import Frame, Image
+from fieldkit.types import Frame, SeenTag
 
 Progress = Callable[[str, int, int], None]
 
@@ -84,10 +84,8 @@ def find_sweep(
 
     Without odometry the body is taken to stand. Raises TagError when no tag is seen MIN_SIGHTINGS times in one stand.
     """
-    looks = _looks(recording)
-    frames, left_out = _standing(recording, [frame for frame, _ in looks])
+    frames, left_out = _standing(recording)
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_IMAGES)).astype(int))]
-    told = {frame.t_ns: detections for frame, detections in looks}
     found: list[tuple[Frame, TagDetection]] = []
     other = 0
     for number, frame in enumerate(chosen):
@@ -96,8 +94,7 @@ def find_sweep(
         if frame.camera != chosen[0].camera:
             other += 1
             continue
-        known = told[frame.t_ns]
-        seen = detect(frame.read(), frame.camera, families=families) if known is None else known
+        seen = detect(frame.read(), frame.camera, families=families) if frame.tags is None else _recorded(frame.tags)
         ids = [d.id for d in seen]
         found += [(frame, d) for d in seen if ids.count(d.id) == 1 and (d.id in sizes_m or None in sizes_m)]
     if other:
@@ -105,28 +102,14 @@ def find_sweep(
     return _group(recording, found, sizes_m, len(chosen), left_out)
 
 
-def _looks(recording: ArmRecording) -> list[tuple[Frame, list[TagDetection] | None]]:
-    """Return every image; or, where there is none, every message of somebody else's detector with what it found."""
-    if recording.frames:
-        return [(frame, None) for frame in recording.frames]
-    by_time: dict[int, list[TagDetection]] = {}
-    frames: dict[int, Frame] = {}
-    for tag in read_detections(recording.path).tags:
-        camera = recording.camera_at(tag.t_ns)
-        corners = tag.corners(camera)
-        if corners is not None:
-            frames[tag.t_ns] = Frame(tag.t_ns, camera, None, _no_image)
-            detection = TagDetection(tag.id, tag.family or "tag36h11", corners, COARSE_SIGMA_PX)
-            by_time.setdefault(tag.t_ns, []).append(detection)
-    return [(frame, by_time[t_ns]) for t_ns, frame in sorted(frames.items())]
+def _recorded(tags: Sequence[SeenTag]) -> list[TagDetection]:
+    """Return what somebody else's detector found as if it were ours."""
+    return [TagDetection(t.id, t.family or "tag36h11", t.corners_px, COARSE_SIGMA_PX) for t in tags]
 
 
-def _no_image() -> Image:
-    raise AssertionError("a recorded detection has no image")
-
-
-def _standing(recording: ArmRecording, frames: Sequence[Frame]) -> tuple[list[Frame], dict[str, int]]:
+def _standing(recording: ArmRecording) -> tuple[list[Frame], dict[str, int]]:
     """Return the frames whose kinematics reach far enough and at which the body stands, and what was left out."""
+    frames = [f for f in recording.frames if f.tags is None or f.tags]
     stamps = [f.t_ns for f in frames]
     if not stamps:
         raise TagError(

@@ -199,6 +199,7 @@ def _provenance(run: Run) -> tuple[tuple[str, str], ...]:
         ("Run folder", run.path or "not saved"),
         ("Map digest", run.map_digest or "none"),
         ("Tags digest", run.tags_digest or "none"),
+        ("Corrections", "; ".join(f"{c.kind}: {c.path} ({c.digest})" for c in run.corrections) or "none"),
         ("Seed", str(run.seed)),
         ("Versions", ", ".join(f"{name} {version}" for name, version in sorted(run.versions.items())) or "none"),
     )  # fmt: skip

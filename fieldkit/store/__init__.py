@@ -1,5 +1,6 @@
 """Nouns on disk: text files that others read, content digests, and writing that leaves the old or the new."""
 
+from fieldkit.store.corrections import Corrections, read_corrections
 from fieldkit.store.datasets import is_dataset
 from fieldkit.store.files import (
     atomic_folder,
@@ -35,6 +36,7 @@ from fieldkit.store.tags import read_tags, write_tags
 from fieldkit.store.versions import library_versions
 
 __all__ = [
+    "Corrections",
     "EstimateCache",
     "Hand",
     "PhotoEntry",
@@ -48,6 +50,7 @@ __all__ = [
     "library_versions",
     "plain_json",
     "read_camera",
+    "read_corrections",
     "read_hand",
     "read_json",
     "read_photos",

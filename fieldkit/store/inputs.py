@@ -17,6 +17,8 @@ from fieldkit.store.files import atomic_write, read_text, read_toml, write_toml
 from fieldkit.types import ViewKind
 
 Size = Annotated[int, msgspec.Meta(gt=0)]
+# Stamps that are later than this are no latency but another clock, or a number in ms
+MAX_LATENCY_S = 1.0
 
 
 class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -49,35 +51,56 @@ class _HandFile(msgspec.Struct, forbid_unknown_fields=True):
     position_m: list[float]
     quaternion_xyzw: list[float]
     covariance: list[float] | None = None
+    latency_s: float | None = None
+    latency_sigma_s: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Hand:
-    """Where the camera sits in the hand: two frames of tf, hand_from_cam, and its 6x6 covariance where it is known."""
+    """Where the camera sits in the hand: two frames of tf, hand_from_cam, and its 6x6 covariance where it is known.
+
+    ``latency`` is by how much (s) the images' stamps are late against tf, and its sigma; None where it is not known.
+    """
 
     parent: str
     child: str
     hand_from_cam: Pose
     covariance: Array | None = None
+    latency: tuple[float, float] | None = None
 
 
 def read_hand(path: Path) -> Hand:
-    """Read hand.toml: parent and child frame, position_m, quaternion_xyzw of hand_from_cam, covariance?."""
+    """Read hand.toml: parent and child, position_m, quaternion_xyzw of hand_from_cam, covariance?, latency_s?."""
     data = read_toml(path, _HandFile, what="hand.toml with parent, child, position_m and quaternion_xyzw")
     try:
         if data.covariance is not None and len(data.covariance) != 36:
             raise StoreError(f"covariance has {len(data.covariance)} numbers; expected 36, row-major")
         covariance = None if data.covariance is None else np.asarray(data.covariance).reshape(6, 6)
-        return Hand(data.parent, data.child, pose(data.position_m, data.quaternion_xyzw), covariance)
+        hand_from_cam = pose(data.position_m, data.quaternion_xyzw)
+        return Hand(data.parent, data.child, hand_from_cam, covariance, _latency(data))
     except FieldkitError as error:
         raise StoreError(f"{path}: {error.message}", hint=error.hint) from error
+
+
+def _latency(data: _HandFile) -> tuple[float, float] | None:
+    if data.latency_s is None and data.latency_sigma_s is None:
+        return None
+    late_s, sigma_s = data.latency_s, data.latency_sigma_s
+    # Written so that nan fails it too
+    if late_s is None or sigma_s is None or not (abs(late_s) < MAX_LATENCY_S and 0 <= sigma_s < MAX_LATENCY_S):
+        raise StoreError(
+            f"latency_s {late_s} and latency_sigma_s {sigma_s}; expected both, in s and below {MAX_LATENCY_S:g}",
+            hint="correct the two lines, or remove both",
+        )
+    return late_s, sigma_s
 
 
 def write_hand(path: Path, hand: Hand) -> None:
     """Write hand.toml."""
     xyz, quaternion = position_quaternion(hand.hand_from_cam)
     covariance = None if hand.covariance is None else [float(v) for v in np.asarray(hand.covariance).ravel()]
-    write_toml(path, _HandFile(1, hand.parent, hand.child, xyz, quaternion, covariance))
+    late = hand.latency or (None, None)
+    write_toml(path, _HandFile(1, hand.parent, hand.child, xyz, quaternion, covariance, *late))
 
 
 @dataclasses.dataclass(frozen=True)

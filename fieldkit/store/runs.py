@@ -35,6 +35,7 @@ from fieldkit.store.tables import (
 from fieldkit.store.tags import read_tags, write_tags
 from fieldkit.types import (
     VIEW_KINDS,
+    Applied,
     Candidates,
     Estimate,
     Excluded,
@@ -80,6 +81,7 @@ class _RunFile(msgspec.Struct, forbid_unknown_fields=True):
     versions: dict[str, str]
     sessions: list[str]
     excluded: list[Excluded]
+    corrections: list[Applied] = []
 
 
 def write_run(path: Path, run: Run, *, force: bool = False) -> None:
@@ -87,7 +89,7 @@ def write_run(path: Path, run: Run, *, force: bool = False) -> None:
     with atomic_folder(Path(path), force=force, marker="run.json") as folder:
         head = _RunFile(
             1, protocols.to_dict(run.protocol), run.map_digest, run.tags_digest, list(run.recordings), run.seed,
-            dict(run.versions), list(run.sessions), list(run.excluded),
+            dict(run.versions), list(run.sessions), list(run.excluded), list(run.corrections),
         )  # fmt: skip
         write_table(folder / "trials.csv", TRIALS, (_trial_cells(t) for t in run.trials))
         write_table(folder / "estimates.csv", ESTIMATES, (_result_cells(r) for r in run.results))
@@ -130,6 +132,7 @@ def read_run(path: Path) -> Run:
         excluded=tuple(head.excluded),
         path=str(path),
         tags=read_tags(path / TAGS_FILE) if (path / TAGS_FILE).is_file() else None,
+        corrections=tuple(head.corrections),
     )
 
 
