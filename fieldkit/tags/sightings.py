@@ -14,7 +14,7 @@ from fieldkit.odometry import PlacedTag, travel
 from fieldkit.protocol import OdometryNoise
 from fieldkit.tags.detect import TagDetection, detect
 from fieldkit.tags.pose import solve
-from fieldkit.types import Frame, Recording, SeenTag, TagPose
+from fieldkit.types import Frame, OdometryFault, Recording, SeenTag, TagPose
 
 # The body has made a step where odometry moved by more than this: less is jitter of a robot that stands
 STAND_M, STAND_RAD = 0.01, math.radians(0.5)
@@ -114,12 +114,14 @@ def body_sightings(
     *,
     odometry: Trajectory,
     noise: OdometryNoise,
+    faults: Sequence[OdometryFault] = (),
     max_frames: int = 60,
 ) -> BodySightings:
     """Find tags in frames of a robot that stands or moves little, and place the cameras relative to its body.
 
     The reference is the body at the last frame with kinematics and odometry. Motion between a frame and the
-    reference comes from odometry deltas, never from its absolute pose. Of more than ``max_frames`` so many are
+    reference comes from odometry deltas, never from its absolute pose; a jump among ``faults`` is in the covariance of
+    its step with its size. Of more than ``max_frames`` so many are
     searched, evenly spread. Frames whose tags were detected while recording are not searched. A tag that is twice in an
     image is left out of it.
     """
@@ -147,7 +149,10 @@ def body_sightings(
     seen = _seen(places, tags)
     times = [placed[i][0].t_ns for i in begins]
     steps = tuple(
-        (places[i].ref_from_body, travel(odometry, before, places[i].frame.t_ns, noise=noise)[1] + STEP_FLOOR)
+        (
+            places[i].ref_from_body,
+            travel(odometry, before, places[i].frame.t_ns, noise=noise, faults=faults)[1] + STEP_FLOOR,
+        )
         for before, i in zip(times, begins[1:], strict=False)
     )
     return BodySightings(reference, seen, places, steps, len(chosen), no_kinematics, no_odometry, last_error)

@@ -124,9 +124,10 @@ def _alone(
     found: BodySightings, seen: Sequence[BodySighting], tag: TagPose, arm: ArmNoise
 ) -> tuple[_Part, Pose, Array]:
     """Return the sightings of one tag that agree, the body that they show by themselves, and what a flip adds to it."""
-    total = image_covariance(arm)
+    total, stands = image_covariance(arm), [s.place.stand for s in seen]
+    home = max(sorted(set(stands), reverse=True), key=stands.count)
     sightings = [
-        Sighting(s.detection, s.place.frame.camera, s.place.ref_from_cam, total + _step_noise(s.place, found))
+        Sighting(s.detection, s.place.frame.camera, s.place.ref_from_cam, total + _step_noise(s.place, found, home))
         for s in seen
     ]
     fix = fuse_sightings(sightings, tag.size_m)
@@ -174,11 +175,11 @@ def tilt(map_from_body: Pose) -> float:
     return float(np.arccos(np.clip(map_from_body.rotation.as_matrix()[2, 2], -1.0, 1.0)))
 
 
-def _step_noise(place: Place, found: BodySightings) -> Array:
-    """Return the 6x6 covariance of a camera's place by the steps between it and the reference."""
+def _step_noise(place: Place, found: BodySightings, home: int) -> Array:
+    """Return the 6x6 covariance of a camera's place by the steps between it and the stand from which most is seen."""
     total = np.zeros((6, 6))
     cam_from_ref = place.ref_from_cam.inv()
-    for ref_from_begin, covariance in found.steps[place.stand :]:
+    for ref_from_begin, covariance in found.steps[min(place.stand, home) : max(place.stand, home)]:
         effect = adjoint(cam_from_ref * ref_from_begin)
         total += effect @ covariance @ effect.T
     return total
@@ -242,7 +243,7 @@ class _Problem:
         self.points = np.stack([tag_corners(parts[k].tag.size_m) for k, _ in rows])
         self.xy = np.stack([s.place.frame.camera.unproject(s.detection.corners_px)[:, :2] for _, s in rows])
         self.lens = np.stack([_lens(s.place.frame.camera, xy) for (_, s), xy in zip(rows, self.xy, strict=True)])
-        self.variance = np.array([s.detection.sigma_px**2 for _, s in rows])[:, None, None] * np.eye(8)
+        self.variance = np.stack([s.detection.noise_px for _, s in rows])
         shared = _inverse(_diagonal(max(arm.camera_deg, 1e-5), max(arm.camera_m, 1e-7)))
         priors = [shared, *(_inverse(c) for _, c in found.steps), *(_tag_prior(p.tag) for p in parts)]
         self.prior = block_diag(np.zeros((6, 6)), *priors)
