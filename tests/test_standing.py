@@ -222,4 +222,3 @@ def test_one_sighting_is_enough_and_its_body_stands_upright() -> None:
     fix = locate_body(found, tag, arm=ARM)
     assert fix.used == {1: 1}
     assert fix.map_from_body.rotation.as_matrix()[2, 2] > 0.99
-    assert (CAMERA.width, SIZE_M) == (640, 0.1365)

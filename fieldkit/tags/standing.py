@@ -31,6 +31,8 @@ AGREES = float(chi2_law.ppf(0.9999, 6))
 UPRIGHT_RAD = math.radians(2.0)
 # Residuals widen the covariance where they exceed their noise beyond one in a hundred
 WIDEN = 0.99
+# Added to a tag's variances, in rad^2 and m^2: zeros say that it is known exactly, and have no inverse
+EXACT = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -320,7 +322,7 @@ class _Problem:
 
 def _tag_prior(tag: TagPose) -> Array:
     try:
-        return _inverse(tag.covariance)
+        return _inverse(tag.covariance + EXACT * np.eye(6))
     except np.linalg.LinAlgError as error:
         raise TagError(
             f"the covariance of tag {tag.id} is not positive definite; expected 36 numbers as calibration writes them",
