@@ -42,13 +42,18 @@ def travel(
             steps.append((length, turn))
     covariance = _growth(path[-1].inv(), anchors, steps, noise)
     first, last = min(t_from_ns, t_to_ns), max(t_from_ns, t_to_ns)
-    for fault in faults:
-        if fault.kind == "jump" and max(first, fault.t_begin_ns) < min(last, fault.t_end_ns):
-            position, angle = fault.excess
-            beyond = fault.t_end_ns if t_from_ns <= t_to_ns else fault.t_begin_ns
-            effect = adjoint(path[-1].inv() * odometry.at(min(max(beyond, first), last)))
-            covariance += effect @ np.diag([angle**2] * 3 + [position**2] * 3) @ effect.T
+    for jump in jumps_between(faults, first, last):
+        position, angle = jump.excess
+        beyond = jump.t_end_ns if t_from_ns <= t_to_ns else jump.t_begin_ns
+        effect = adjoint(path[-1].inv() * odometry.at(min(max(beyond, first), last)))
+        covariance += effect @ np.diag([angle**2] * 3 + [position**2] * 3) @ effect.T
     return path[0].inv() * path[-1], covariance, sum(length for length, _ in steps)
+
+
+def jumps_between(faults: Sequence[OdometryFault], first_ns: int, last_ns: int) -> list[OdometryFault]:
+    """Return the jumps among faults of which any part lies between two times."""
+    jumps = [f for f in faults if f.kind == "jump"]
+    return [f for f in jumps if max(first_ns, f.t_begin_ns) < min(last_ns, f.t_end_ns)]
 
 
 def _growth(

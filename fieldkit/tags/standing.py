@@ -31,8 +31,9 @@ AGREES = float(chi2_law.ppf(0.9999, 6))
 UPRIGHT_RAD = math.radians(2.0)
 # Residuals widen the covariance where they exceed their noise beyond one in a hundred
 WIDEN = 0.99
-# Added to a tag's variances, in rad^2 and m^2: zeros say that it is known exactly, and have no inverse
-EXACT = 1e-12
+# Added to a tag's variances, in rad^2 and m^2, and as a share of them: a tag that is known exactly, or exactly along a
+# direction in rounded numbers, has a covariance without inverse
+EXACT, ROUNDED = 1e-12, 2e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,7 +234,7 @@ class _Problem:
 
     def __init__(self, found: BodySightings, parts: Sequence[_Part], arm: ArmNoise) -> None:
         self.parts, self.image = parts, image_covariance(arm)
-        self.steps = tuple(pose for pose, _ in found.steps)
+        self.steps, self.step_means = tuple(pose for pose, _ in found.steps), np.ravel(found.step_means)
         rows = [(k, s) for k, part in enumerate(parts) for s in part.sightings]
         self.tag_of = np.array([k for k, _ in rows])
         self.tags_at = 12 + 6 * len(self.steps)
@@ -297,7 +298,7 @@ class _Problem:
 
     def _deviation(self, state: _State) -> Array:
         tags = [log(p.tag.map_from_tag.inv() * pose) for p, pose in zip(self.parts, state.map_from_tags, strict=True)]
-        return np.concatenate([np.zeros(6), state.shared, state.step_errors.ravel(), *tags])
+        return np.concatenate([np.zeros(6), state.shared, state.step_errors.ravel() - self.step_means, *tags])
 
     def minimise(self, state: _State, scale: float, *, iterations: int = 15) -> tuple[_State, Array, float, float]:
         """Return the state that minimises the weighted residuals, and normal matrix, chi-square and log determinant."""
@@ -322,7 +323,7 @@ class _Problem:
 
 def _tag_prior(tag: TagPose) -> Array:
     try:
-        return _inverse(tag.covariance + EXACT * np.eye(6))
+        return _inverse(tag.covariance * (1 + ROUNDED * np.eye(6)) + EXACT * np.eye(6))
     except np.linalg.LinAlgError as error:
         raise TagError(
             f"the covariance of tag {tag.id} is not positive definite; expected 36 numbers as calibration writes them",
