@@ -133,7 +133,13 @@ def _from_tags(
     others = [t for t in _standing(tags) if t.id != tag.id]
     frames = frames_between(recording, start.t_begin_ns, start.t_end_ns)
     try:
-        found = body_sightings(frames, [tag, *others], odometry=recording.odometry, noise=noise)
+        found = body_sightings(
+            frames,
+            [tag, *others],
+            odometry=recording.odometry,
+            noise=noise,
+            faults=recording.odometry_faults,
+        )
         fix = locate_body(found, tag, arm=arm, others=others) if found.of(tag) else None
     except TagError as error:
         raise PriorError(f"{what}: start tag {tag.id}: {error.message}", hint=error.hint) from error

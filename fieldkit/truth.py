@@ -74,7 +74,12 @@ def _from_tag(
 ) -> dict[str, Truth]:
     try:
         found = body_sightings(
-            _frames(recording, visit), [tag], odometry=recording.odometry, noise=noise, max_frames=MAX_IMAGES
+            _frames(recording, visit),
+            [tag],
+            odometry=recording.odometry,
+            noise=noise,
+            faults=recording.odometry_faults,
+            max_frames=MAX_IMAGES,
         )
         fix = locate_body(found, tag, arm=arm) if found.sightings else None
     except TagError as error:

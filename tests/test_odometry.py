@@ -124,6 +124,23 @@ def test_a_jump_on_the_way_widens_the_covariance_by_its_size() -> None:
     np.testing.assert_array_equal(elsewhere, travel(odometry, int(t[250]), int(t[350]), noise=noise)[1])
 
 
+def test_a_jump_counts_once_on_every_way_that_touches_it_in_either_direction() -> None:
+    t, moved = times(), exp([0, 0, 0, 0.3, 0, 0])
+    poses = [p * moved if i >= 200 else p for i, p in enumerate(wander(t))]
+    odometry, faults, inside = Trajectory(t, tuple(poses), "odom", "body"), find_faults(t, poses), int(t[199]) + 7 * MS
+
+    def added(begin: int, end: int) -> float:
+        plain, wide = (travel(odometry, begin, end, noise=OdometryNoise(), faults=f)[1] for f in ((), faults))
+        return float(np.trace((wide - plain)[3:, 3:]))
+
+    whole = added(int(t[190]), int(t[210]))
+    assert math.sqrt(whole) == pytest.approx(0.3 * math.sqrt(3), rel=0.1)
+    for begin, end in ((int(t[190]), inside), (inside, int(t[210])), (int(t[210]), inside), (int(t[210]), int(t[190]))):
+        assert added(begin, end) == pytest.approx(whole, rel=0.1)
+    for begin, end in ((int(t[190]), int(t[199])), (int(t[200]), int(t[210])), (inside, inside)):
+        assert added(begin, end) == 0.0
+
+
 def seen_in_motion(offset_ms: int, *, still: bool = False, noise: float = 0.004) -> tuple[Trajectory, list[PlacedTag]]:
     """Odometry and sightings of two standing tags whose images are stamped late by an offset."""
     rng, t = np.random.default_rng(4), times()

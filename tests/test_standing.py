@@ -7,10 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from standing_scenes import CAMERA, SECOND, SIZE_M, Settings, Standing, stand
+from standing_scenes import SECOND, Settings, Standing, stand
 
 from fieldkit.errors import PriorError, TruthError
-from fieldkit.frames import Array, Pose, Trajectory, exp, log, pose_error
+from fieldkit.frames import Array, Pose, Trajectory, adjoint, exp, log, pose_error, skew, yaw_pose
+from fieldkit.odometry import find_faults
 from fieldkit.prior import estimate_prior
 from fieldkit.protocol import ArmNoise, OdometryNoise
 from fieldkit.tags import body_sightings, locate_body
@@ -146,6 +147,66 @@ def test_a_step_within_the_visit_makes_views_on_its_other_side_less_certain() ->
     assert min(after) > 0.04
 
 
+def jumping(scene: Standing, seconds: float, jump: Pose) -> Standing:
+    """Let odometry jump at a time while the robot stands, and find it as a recording does."""
+    odometry = scene.recording.odometry
+    after = odometry.t_ns >= seconds * SECOND
+    at = odometry.poses[int(after.argmax())]
+    poses = [at * jump * at.inv() * p if a else p for a, p in zip(after, odometry.poses, strict=True)]
+    recording = dataclasses.replace(
+        scene.recording,
+        odometry=dataclasses.replace(odometry, poses=tuple(poses)),
+        odometry_faults=find_faults(odometry.t_ns, poses),
+    )
+    assert [f.kind for f in recording.odometry_faults] == ["jump"]
+    return dataclasses.replace(scene, recording=recording)
+
+
+@pytest.mark.parametrize("seconds", [22.95, 24.5])
+def test_tags_seen_on_both_sides_of_a_jump_keep_the_truth_true(seconds: float) -> None:
+    ratios = []
+    for seed in range(4):
+        jump = yaw_pose([0.3, (-1) ** seed * 0.15, 0.0], 0.09)
+        whole = stand(np.random.default_rng(seed), Settings(walk_m=0.0))
+        scene = jumping(whole, seconds, jump)
+        truths, plain = truths_of(scene), truths_of(whole)
+        for view in ("00", "03", "11"):
+            ratios.append(nees(truths[view].map_from_cam, scene.map_from_cam[view], truths[view].covariance))
+            assert truths[view].sigma[0] < 3 * plain[view].sigma[0]
+    assert 0.3 < np.mean(ratios) < 1.71
+
+
+def test_a_jump_that_puts_the_tag_beside_the_camera_leaves_the_truth_true() -> None:
+    whole = stand(np.random.default_rng(5), Settings(walk_m=0.0))
+    plain = truths_of(whole)
+    for jump in (yaw_pose([0.8, 0.0, 0.0], 0.24), yaw_pose([1.5, 1.5, 0.0], 1.0)):
+        scene = jumping(whole, 23.0, jump)
+        truths = truths_of(scene)
+        for view in ("01", "06"):
+            assert nees(truths[view].map_from_cam, scene.map_from_cam[view], truths[view].covariance) < 2
+            assert pose_error(truths[view].map_from_cam, plain[view].map_from_cam)[0] < 0.03
+
+
+def test_views_that_only_a_jump_leads_to_are_as_uncertain_as_the_jump_is_large() -> None:
+    scene = jumping(stand(np.random.default_rng(1), Settings(walk_m=0.0)), 27.05, yaw_pose([0.3, 0.15, 0.0], 0.09))
+    truths = truths_of(scene)
+    for view, true in scene.map_from_cam.items():
+        truth, is_beyond = truths[view], int(view) > 15
+        assert (truth.sigma[0] > 0.3) == is_beyond
+        assert nees(truth.map_from_cam, true, truth.covariance) < 3
+
+
+@pytest.mark.parametrize("seconds", [2.5, 3.1])
+def test_a_jump_at_the_start_is_in_the_prior(seconds: float) -> None:
+    ratios = []
+    for seed in range(5):
+        jump = yaw_pose([0.3, (-1) ** seed * 0.15, 0.0], 0.09)
+        scene = jumping(stand(np.random.default_rng(seed), Settings(walk_m=3.0)), seconds, jump)
+        prior = prior_of(scene)
+        ratios.append(nees(prior.map_from_body, scene.map_from_body, prior.covariance))
+    assert 0.3 < np.mean(ratios) < 1.9
+
+
 def test_noise_of_recorded_corners_is_that_of_their_residuals() -> None:
     for corner_px in (0.2, 0.6):
         scene = stand(np.random.default_rng(6), Settings(states_sigma=False, corner_px=corner_px, n_start=60))
@@ -201,6 +262,52 @@ def test_a_covariance_of_a_tag_that_is_not_positive_definite_is_named() -> None:
         truths_of(other)
 
 
+def test_tags_that_are_known_exactly_give_prior_and_truth() -> None:
+    scene = stand(np.random.default_rng(10), Settings(walk_m=0.0, n_start_tags=2, tag_m=1e-9, tag_deg=1e-7))
+    exact = tuple(dataclasses.replace(t, covariance=np.zeros((6, 6))) for t in scene.tags.tags)
+    zeros = dataclasses.replace(scene, tags=dataclasses.replace(scene.tags, tags=exact))
+    one, other = prior_of(scene), prior_of(zeros)
+    assert pose_error(other.map_from_body, one.map_from_body) == pytest.approx((0, 0), abs=1e-6)
+    np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-3, atol=1e-9)
+    for view, truth in truths_of(zeros).items():
+        assert nees(truth.map_from_cam, scene.map_from_cam[view], truth.covariance) < 4
+
+
+def test_tags_whose_rounded_covariance_is_singular_give_a_prior() -> None:
+    scene = stand(np.random.default_rng(10), Settings(walk_m=0.0))
+    along = 1e-4 * np.outer(np.ones(6), np.ones(6))
+    rounded = along - 5e-7 * along[0, 0] * np.outer([1, -1, 0, 0, 0, 0], [1, -1, 0, 0, 0, 0])
+    assert np.linalg.eigvalsh(rounded)[0] < -1e-11
+    tags = tuple(dataclasses.replace(t, covariance=rounded) for t in scene.tags.tags)
+    prior = prior_of(dataclasses.replace(scene, tags=dataclasses.replace(scene.tags, tags=tags)))
+    assert np.linalg.eigvalsh(prior.covariance)[0] > 0
+
+
+def test_corners_count_with_their_full_covariance() -> None:
+    """A detection whose corners move together tells less of the tag's place than one whose corners move apart."""
+    scene = stand(np.random.default_rng(13), Settings(walk_m=0.0))
+    tag = dataclasses.replace(scene.tags.tags[0], covariance=np.zeros((6, 6)))
+    found = body_sightings(scene.recording.frames[:1], [tag], odometry=scene.recording.odometry, noise=NOISE)
+    together = 0.2**2 * (0.1 * np.eye(8) + 0.9 * np.kron(np.ones((4, 4)), np.eye(2)))
+    exact = ArmNoise(image_deg=1e-6, image_m=1e-8, camera_deg=0, camera_m=0, base_deg=0, base_m=0)
+
+    def sigma_of_bearing(covariance_px: Array | None) -> float:
+        (s,) = found.sightings
+        detection = dataclasses.replace(s.detection, covariance_px=covariance_px)
+        fix = locate_body(
+            dataclasses.replace(found, sightings=(dataclasses.replace(s, detection=detection),)), tag, arm=exact
+        )
+        cam_from_tag = (fix.map_from_body * s.place.ref_from_cam).inv() * tag.map_from_tag
+        by_cam = adjoint(s.place.ref_from_cam.inv())
+        in_cam = by_cam @ fix.joint[:6, :6] @ by_cam.T
+        lever = np.hstack([skew(cam_from_tag.translation), -np.eye(3)])
+        across = (lever @ in_cam @ lever.T)[:2, :2]
+        return float(np.sqrt(np.linalg.eigvalsh(across)[0]))
+
+    assert sigma_of_bearing(None) == pytest.approx(sigma_of_bearing(0.2**2 * np.eye(8)), rel=1e-9)
+    assert sigma_of_bearing(together) > 1.3 * sigma_of_bearing(None)
+
+
 def test_the_topics_own_covariance_is_used_where_it_states_one() -> None:
     scene = stand(np.random.default_rng(11), Settings())
     body = scene.recording.odometry
@@ -222,4 +329,3 @@ def test_one_sighting_is_enough_and_its_body_stands_upright() -> None:
     fix = locate_body(found, tag, arm=ARM)
     assert fix.used == {1: 1}
     assert fix.map_from_body.rotation.as_matrix()[2, 2] > 0.99
-    assert (CAMERA.width, SIZE_M) == (640, 0.1365)

@@ -69,7 +69,21 @@ def test_a_bag_without_images_opens_with_its_detections_as_frames(tmp_path: Path
 def test_inspect_counts_detections_per_tag(tmp_path: Path) -> None:
     found = inspect_recording(extended(tmp_path, {"image"}, detections()))
     assert found["detections"] == {"topics": [{"name": "/tags", "count": 41}], "tags": {"7": 20}}
-    assert found["missing"] == []
+    (missing,) = found["missing"]
+    assert missing.endswith("/arm_camera/image_raw; tag detections alone leave nothing to localize")
+
+
+def test_a_bag_without_images_and_with_another_camera_s_detections_is_named(tmp_path: Path) -> None:
+    path = extended(tmp_path, {"image"}, detections("head_camera"))
+    message = (
+        r"robot\.bag: no image and no tag detection of the arm camera \(41 detections on /tags are of frame "
+        r"'head_camera', not of the arm camera; left out\); expected images of it; record"
+    )
+    with pytest.raises(BagError, match=message):
+        open_recording(path)
+    found = inspect_recording(path)
+    assert [m for m in found["missing"] if m.startswith("images on ")]
+    assert any("frame 'head_camera'" in w for w in found["warnings"])
 
 
 def test_detections_of_another_camera_and_doubtful_ones_are_left_out(tmp_path: Path) -> None:
@@ -84,23 +98,31 @@ def test_detections_of_another_camera_and_doubtful_ones_are_left_out(tmp_path: P
     assert all(f.tags == () for f in doubtful.tag_frames)
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_a_reference_s_covariance_is_turned_into_the_body_s_own_frame(tmp_path: Path, *, stated: bool) -> None:
-    fixed = np.diag([0.04, 0.01, 0.09, 1e-4, 2e-4, 3e-4])
+FIXED = np.diag([0.04, 0.01, 0.09, 1e-4, 2e-4, 3e-4])
 
+
+def references(covariances: Callable[[int], Any]) -> Callable[[Typestore], Extra]:
     def make(store: Typestore) -> Extra:
         kind, inner = "geometry_msgs/msg/PoseWithCovarianceStamped", store.types["geometry_msgs/msg/PoseWithCovariance"]
-        values = fixed.ravel() if stated else np.zeros(36)
         return [
             (
                 stamp(i), "/fieldkit/reference", kind,
-                store.types[kind](header(store, stamp(i), "map"), inner(ros_pose(store, odom_from_body(i)), values)),
+                store.types[kind](
+                    header(store, stamp(i), "map"), inner(ros_pose(store, odom_from_body(i)), covariances(i).ravel())
+                ),
             )
             for i in range(41)
         ]  # fmt: skip
 
-    recording = open_recording(extended(tmp_path, {"reference"}, make))
+    return make
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_reference_s_covariance_is_turned_into_the_body_s_own_frame(tmp_path: Path, *, stated: bool) -> None:
+    values = FIXED if stated else np.zeros((6, 6))
+    recording = open_recording(extended(tmp_path, {"reference"}, references(lambda _: values)))
     assert recording.reference is not None
+    assert recording.warnings == ()
     if not stated:
         assert recording.reference_covariance is None
         assert recording.reference_covariance_at(stamp(20)) is None
@@ -108,5 +130,40 @@ def test_a_reference_s_covariance_is_turned_into_the_body_s_own_frame(tmp_path: 
     covariance = recording.reference_covariance_at(stamp(40))
     assert covariance is not None
     turn = odom_from_body(40).rotation.as_matrix()
-    np.testing.assert_allclose(turn @ covariance[3:, 3:] @ turn.T, fixed[:3, :3], atol=1e-9)
-    np.testing.assert_allclose(turn @ covariance[:3, :3] @ turn.T, fixed[3:, 3:], atol=1e-9)
+    np.testing.assert_allclose(turn @ covariance[3:, 3:] @ turn.T, FIXED[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(turn @ covariance[:3, :3] @ turn.T, FIXED[3:, 3:], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("broken", "reason"),
+    [
+        (FIXED * np.where(np.arange(6) == 2, -1, 1), "not positive definite"),
+        (FIXED + 0.5 * (np.eye(6, k=1) + np.eye(6, k=-1)), "not positive definite"),
+        (np.diag([0.04, 0.01, 0.0, 0.0, 0.0, 3e-4]), "not positive definite"),
+        (FIXED + 0.005 * np.eye(6, k=1), "not symmetric"),
+        (FIXED * np.where(np.arange(6) == 2, np.nan, 1), "not finite"),
+    ],
+)
+def test_covariances_of_the_reference_that_cannot_be_are_counted_and_named(
+    tmp_path: Path, broken: Any, reason: str
+) -> None:
+    path = extended(tmp_path, {"reference"}, references(lambda _: broken))
+    recording = open_recording(path)
+    assert recording.reference_covariance is None
+    line = f"/fieldkit/reference: of 41 covariances 41 {reason}; used for these samples: 5 mm and 0.2 deg per axis"
+    assert line in recording.warnings
+    assert line in inspect_recording(path)["warnings"]
+
+
+def test_samples_of_the_reference_that_state_a_covariance_count_where_others_do_not(tmp_path: Path) -> None:
+    def mixed(i: int) -> Any:
+        return -FIXED if i == 5 else np.zeros((6, 6)) if i == 30 else FIXED * (1 + i)
+
+    recording = open_recording(extended(tmp_path, {"reference"}, references(mixed)))
+    assert recording.warnings == (
+        "/fieldkit/reference: of 41 covariances 1 not positive definite, 1 not stated; used for these samples: that of "
+        "the nearest sample that states one",
+    )
+    assert recording.reference_covariance is not None
+    sizes = np.trace(recording.reference_covariance, axis1=1, axis2=2) / np.trace(FIXED)
+    np.testing.assert_allclose([sizes[i] for i in (0, 4, 5, 6, 29, 30, 40)], [1, 5, 5, 7, 30, 30, 41], rtol=1e-9)

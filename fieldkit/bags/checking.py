@@ -30,3 +30,19 @@ def odometry_elsewhere(bag: BagFile, content: Content) -> list[str]:
             faults = odometry_faults(content, read_odometry(bag, name))
             lines += [line.replace("odometry:", f"odometry on {name}:", 1) for line in summarize_faults(faults)]
     return lines
+
+
+def covariance_warnings(content: Content, topic: str) -> list[str]:
+    """Return one line where the reference topic states covariances that cannot be used, and what is used instead."""
+    samples = content.reference
+    stated = sum(c is not None for c in samples.covariances)
+    unstated = len(samples.covariances) - stated - samples.refused.total()
+    reasons = [f"{n} {what}" for what, n in sorted(samples.refused.items())]
+    if unstated and (stated or reasons):
+        reasons.append(f"{unstated} not stated")
+    if not reasons:
+        return []
+    instead = "that of the nearest sample that states one" if stated else "5 mm and 0.2 deg per axis"
+    return [
+        f"{topic}: of {len(samples.covariances)} covariances {', '.join(reasons)}; used for these samples: {instead}"
+    ]

@@ -24,6 +24,8 @@ _REFERENCE_TYPES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "nav_msgs/msg/Odometry",
 )
+# Share of the largest number by which a covariance may be asymmetric: rounded to single precision
+ASYMMETRY = 1e-5
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -41,7 +43,8 @@ class ImagePlace:
 class PoseSamples:
     """Stamped poses in the order of arrival, with the frames that their messages name.
 
-    ``received`` are the times of arrival, ``covariances`` (6x6, right perturbation) what the messages state, or None.
+    ``received`` are the times of arrival, ``covariances`` (6x6, right perturbation) what the messages state, or None
+    where they state none or, as ``refused`` says, one that cannot be.
     """
 
     samples: list[tuple[int, Pose]] = dataclasses.field(default_factory=list)
@@ -49,6 +52,7 @@ class PoseSamples:
     child: str = ""
     received: list[int] = dataclasses.field(default_factory=list)
     covariances: list[Array | None] = dataclasses.field(default_factory=list)
+    refused: Counter[str] = dataclasses.field(default_factory=Counter)
 
     def trajectory(self, *, parent: str, child: str) -> tuple[Trajectory, int]:
         """Return the trajectory, and how many samples it left out because their stamp repeats an earlier one."""
@@ -58,10 +62,17 @@ class PoseSamples:
         return Trajectory(stamps, poses, self.parent or parent, self.child or child), len(self.samples) - len(kept)
 
     def covariance(self) -> Array | None:
-        """Return the stated covariances f64[n, 6, 6] of the trajectory's samples; None unless all state one."""
-        stated = [self.covariances[i] for i in self._kept()] if self.covariances else []
-        known = [c for c in stated if c is not None]
-        return np.stack(known) if known and len(known) == len(stated) else None
+        """Return the covariances f64[n, 6, 6] of the trajectory's samples; None where no sample states a usable one.
+
+        A sample without one has that of the nearest in time that states one.
+        """
+        kept = self._kept()
+        stated = [(self.samples[i][0], c) for i in kept if (c := self.covariances[i]) is not None]
+        if not stated:
+            return None
+        stamps = np.array([t for t, _ in stated], dtype=np.int64)
+        nearest = [int(np.argmin(np.abs(stamps - self.samples[i][0]))) for i in kept]
+        return np.stack([stated[k][1] for k in nearest])
 
     def _kept(self) -> list[int]:
         order = sorted(range(len(self.samples)), key=lambda i: self.samples[i][0])
@@ -197,7 +208,11 @@ def add_pose(refused: Counter[str], samples: PoseSamples, message: Any, value: A
         return
     samples.samples.append((stamp_ns(message.header), sample))
     samples.received.append(received_ns)
-    samples.covariances.append(_stated_covariance(message, sample))
+    try:
+        samples.covariances.append(_stated_covariance(message, sample))
+    except BagError as error:
+        samples.covariances.append(None)
+        samples.refused[error.message] += 1
     samples.parent = samples.parent or clean_frame(message.header.frame_id)
     samples.child = samples.child or clean_frame(getattr(message, "child_frame_id", ""))
 
@@ -206,14 +221,21 @@ def _stated_covariance(message: Any, parent_from_child: Pose) -> Array | None:
     """Return the 6x6 covariance (right perturbation, rotation first) that a message states; None where it is unknown.
 
     ROS gives position, then rotation about the parent's fixed axes. Zeros, and -1 in the first place, say unknown.
+    Raises BagError for numbers that are no covariance of a pose.
     """
     values = getattr(message.pose, "covariance", None)
     if values is None:
         return None
     matrix = np.asarray(values, dtype=np.float64).reshape(6, 6)
-    fixed = np.block([[matrix[3:, 3:], matrix[3:, :3]], [matrix[:3, 3:], matrix[:3, :3]]])
-    if not np.isfinite(fixed).all() or not (np.linalg.eigvalsh((fixed + fixed.T) / 2) > 0).all():
+    if matrix[0, 0] == -1 or not matrix.any():
         return None
+    fixed = np.block([[matrix[3:, 3:], matrix[3:, :3]], [matrix[:3, 3:], matrix[:3, :3]]])
+    if not np.isfinite(fixed).all():
+        raise BagError("not finite")
+    if float(np.abs(fixed - fixed.T).max()) > ASYMMETRY * float(np.abs(fixed).max()):
+        raise BagError("not symmetric")
+    if not (np.linalg.eigvalsh((fixed + fixed.T) / 2) > 0).all():
+        raise BagError("not positive definite")
     turn = np.kron(np.eye(2), parent_from_child.rotation.as_matrix().T)
     result: Array = turn @ (fixed + fixed.T) / 2 @ turn.T
     return result

@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from fieldkit.bags.checking import odometry_elsewhere, odometry_faults
+from fieldkit.bags.checking import covariance_warnings, odometry_elsewhere, odometry_faults
 from fieldkit.bags.content import Content, collect
 from fieldkit.bags.events import Marks, find_marks
 from fieldkit.bags.files import BagFile
@@ -50,7 +50,7 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
     missing += _missing(bag, used, content, marks)
     warnings = list(marks.warnings)
     odometry, repeated = content.odometry.trajectory(parent=used.odom_frame, child=used.body_frame)
-    warnings += general_warnings(bag, content, repeated)
+    warnings += [*general_warnings(bag, content, repeated), *covariance_warnings(content, used.reference)]
     warnings += summarize_faults(odometry_faults(content)) if len(odometry) else odometry_elsewhere(bag, content)
     frames: tuple[Frame, ...] = ()
     visits: tuple[Visit, ...] = ()
@@ -91,8 +91,9 @@ def inspect_recording(path: Path | str, *, layout: str | Layout | None = None) -
 
 
 def _missing(bag: BagFile, layout: Layout, content: Content, marks: Marks) -> list[str]:
+    alone = "; tag detections alone leave nothing to localize" if detection_topics(bag) else ""
     needed: list[tuple[object, str]] = [
-        (content.images or detection_topics(bag), f"images on {layout.compressed} or {layout.image}"),
+        (content.images, f"images on {layout.compressed} or {layout.image}{alone}"),
         (content.cameras, f"camera_info on {layout.camera_info}"),
         (content.tf.frames, f"tf on {layout.tf} or {layout.tf_static}"),
         (content.odometry.samples, f"odometry on {layout.odometry}"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldkit.bags.checking import odometry_faults
+from fieldkit.bags.checking import covariance_warnings, odometry_faults
 from fieldkit.bags.content import Content, collect
 from fieldkit.bags.correcting import correct
 from fieldkit.bags.events import Marks, ViewMark, find_marks
@@ -69,12 +69,14 @@ def open_recording(
     odometry, repeated = content.odometry.trajectory(parent=chosen.odom_frame, child=chosen.body_frame)
     frames, unreached = make_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=odometry.child)
     tagged, tag_notes = tag_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=odometry.child)
+    _require_frames(bag, frames or tagged, tag_notes)
     visits, notes = join_views(bag.path, marks, frames or tagged)
     _require_tf(bag.path, visits, content, unreached)
     check_sizes(bag, content, frames)
     warnings = [*general_warnings(bag, content, repeated), *corrected, *marks.warnings, *notes]
     warnings += _tf_warnings(frames, unreached)
     warnings += [*session_warnings(visits, odometry, content), *tag_notes, *summarize_faults(faults)]
+    warnings += covariance_warnings(content, chosen.reference)
     return Recording(
         name=source.name,
         path=str(path),
@@ -251,6 +253,14 @@ def _require_content(bag: BagFile, layout: Layout, content: Content) -> None:
             raise BagError(
                 f"{bag.path}: no usable {what} on {topic}; expected {kind}", hint="see `fieldkit inspect` for its types"
             )
+
+
+def _require_frames(bag: BagFile, frames: Sequence[Frame], notes: Sequence[str]) -> None:
+    if not frames:
+        raise BagError(
+            f"{bag.path}: no image and no tag detection of the arm camera ({'; '.join(notes)}); expected images of it",
+            hint="record the arm camera's images, or name its frame in a Layout",
+        )
 
 
 def _require_tf(path: Path, visits: Sequence[Visit], content: Content, unreached: Sequence[str]) -> None:

@@ -28,9 +28,10 @@ def travel(
 
     Biases are constant along the path, so their standard deviations grow in proportion to it; random walks grow with
     its root. A yaw error moves everything after it. A jump among ``faults`` adds its own size as a standard deviation
-    at its place. Raises FrameError when the samples do not reach or have a gap.
+    at its place, also where one of the times lies inside of it: interpolation has put part of it there. Raises
+    FrameError when the samples do not reach or have a gap.
     """
-    times, path = _path(odometry, t_from_ns, t_to_ns)
+    path = _path(odometry, t_from_ns, t_to_ns)
     anchors = [path[0]]
     steps: list[tuple[float, float]] = []
     for index, pose in enumerate(path[1:], start=1):
@@ -41,12 +42,18 @@ def travel(
             steps.append((length, turn))
     covariance = _growth(path[-1].inv(), anchors, steps, noise)
     first, last = min(t_from_ns, t_to_ns), max(t_from_ns, t_to_ns)
-    for fault in faults:
-        if fault.kind == "jump" and first <= fault.t_begin_ns and fault.t_end_ns <= last:
-            position, angle = fault.excess
-            effect = adjoint(path[-1].inv() * path[times.index(fault.t_end_ns)])
-            covariance += effect @ np.diag([angle**2] * 3 + [position**2] * 3) @ effect.T
+    for jump in jumps_between(faults, first, last):
+        position, angle = jump.excess
+        beyond = jump.t_end_ns if t_from_ns <= t_to_ns else jump.t_begin_ns
+        effect = adjoint(path[-1].inv() * odometry.at(min(max(beyond, first), last)))
+        covariance += effect @ np.diag([angle**2] * 3 + [position**2] * 3) @ effect.T
     return path[0].inv() * path[-1], covariance, sum(length for length, _ in steps)
+
+
+def jumps_between(faults: Sequence[OdometryFault], first_ns: int, last_ns: int) -> list[OdometryFault]:
+    """Return the jumps among faults of which any part lies between two times."""
+    jumps = [f for f in faults if f.kind == "jump"]
+    return [f for f in jumps if max(first_ns, f.t_begin_ns) < min(last_ns, f.t_end_ns)]
 
 
 def _growth(
@@ -69,8 +76,8 @@ def _growth(
     return covariance
 
 
-def _path(odometry: Trajectory, t_from_ns: int, t_to_ns: int) -> tuple[list[int], list[Pose]]:
-    """Return times and poses from one time to the other, both included, in the order of the way."""
+def _path(odometry: Trajectory, t_from_ns: int, t_to_ns: int) -> list[Pose]:
+    """Return poses from one time to the other, both included, in the order of the way."""
     begin, end = odometry.at(t_from_ns), odometry.at(t_to_ns)
     first, last = sorted((t_from_ns, t_to_ns))
     inside = np.flatnonzero((odometry.t_ns > first) & (odometry.t_ns < last))
@@ -84,5 +91,5 @@ def _path(odometry: Trajectory, t_from_ns: int, t_to_ns: int) -> tuple[list[int]
         )
     between = [odometry.poses[int(i)] for i in inside]
     if t_from_ns <= t_to_ns:
-        return times, [begin, *between, end]
-    return times[::-1], [begin, *between[::-1], end]
+        return [begin, *between, end]
+    return [begin, *between[::-1], end]

@@ -10,11 +10,13 @@ import numpy as np
 
 from fieldkit.errors import FrameError, TagError
 from fieldkit.frames import Array, Pose, Trajectory
-from fieldkit.odometry import PlacedTag, travel
+from fieldkit.odometry import PlacedTag, jumps_between, travel
 from fieldkit.protocol import OdometryNoise
 from fieldkit.tags.detect import TagDetection, detect
+from fieldkit.tags.fusion import Sighting
+from fieldkit.tags.jumps import ARM_COVARIANCE, jump_between, move
 from fieldkit.tags.pose import solve
-from fieldkit.types import Frame, Recording, SeenTag, TagPose
+from fieldkit.types import Frame, OdometryFault, Recording, SeenTag, TagPose
 
 # The body has made a step where odometry moved by more than this: less is jitter of a robot that stands
 STAND_M, STAND_RAD = 0.01, math.radians(0.5)
@@ -55,13 +57,15 @@ class BodySightings:
     """Sightings of tags relative to the body at ``t_ns``; how many frames were searched, and what was left out.
 
     ``places`` are all frames with kinematics and odometry. The body moves between its stands only: ``steps`` holds for
-    each stand but the first the body at its begin, ref_from_body, and the 6x6 covariance of the step that led there.
+    each stand but the first the body at its begin, ref_from_body, and the 6x6 covariance of the step that led there;
+    ``step_means`` (6,) are what odometry says of the steps' errors: not zero where a jump has been taken out.
     """
 
     t_ns: int
     sightings: tuple[BodySighting, ...]
     places: tuple[Place, ...]
     steps: tuple[tuple[Pose, Array], ...]
+    step_means: tuple[Array, ...]
     n_frames: int
     no_kinematics: int
     no_odometry: int
@@ -114,12 +118,14 @@ def body_sightings(
     *,
     odometry: Trajectory,
     noise: OdometryNoise,
+    faults: Sequence[OdometryFault] = (),
     max_frames: int = 60,
 ) -> BodySightings:
     """Find tags in frames of a robot that stands or moves little, and place the cameras relative to its body.
 
     The reference is the body at the last frame with kinematics and odometry. Motion between a frame and the
-    reference comes from odometry deltas, never from its absolute pose. Of more than ``max_frames`` so many are
+    reference comes from odometry deltas, never from its absolute pose; a jump among ``faults`` is in the covariance of
+    its step with its size. Of more than ``max_frames`` so many are
     searched, evenly spread. Frames whose tags were detected while recording are not searched. A tag that is twice in an
     image is left out of it.
     """
@@ -136,7 +142,7 @@ def body_sightings(
             no_odometry += 1
             last_error = error.message
     if not placed:
-        return BodySightings(0, (), (), (), len(chosen), no_kinematics, no_odometry, last_error)
+        return BodySightings(0, (), (), (), (), len(chosen), no_kinematics, no_odometry, last_error)
     reference = placed[-1][0].t_ns
     stands, begins = _stands([pose for _, pose, _ in placed])
     ref_from_odom = odometry.at(reference).inv()
@@ -147,10 +153,56 @@ def body_sightings(
     seen = _seen(places, tags)
     times = [placed[i][0].t_ns for i in begins]
     steps = tuple(
-        (places[i].ref_from_body, travel(odometry, before, places[i].frame.t_ns, noise=noise)[1] + STEP_FLOOR)
+        (
+            places[i].ref_from_body,
+            travel(odometry, before, places[i].frame.t_ns, noise=noise, faults=faults)[1] + STEP_FLOOR,
+        )
         for before, i in zip(times, begins[1:], strict=False)
     )
-    return BodySightings(reference, seen, places, steps, len(chosen), no_kinematics, no_odometry, last_error)
+    means = tuple(np.zeros(6) for _ in steps)
+    found = BodySightings(reference, seen, places, steps, means, len(chosen), no_kinematics, no_odometry, last_error)
+    jumped = [k for k in range(len(steps)) if jumps_between(faults, times[k], times[k + 1])]
+    for before, k, after in zip([-1, *jumped], jumped, [*jumped[1:], len(steps)], strict=False):
+        found = _rejoined(found, k, tags, stands=(range(before + 1, k + 1), range(k + 1, after + 1)))
+    return found
+
+
+def _rejoined(
+    found: BodySightings, k: int, tags: Sequence[TagPose], *, stands: tuple[Sequence[int], Sequence[int]]
+) -> BodySightings:
+    """Move all before the jump of step ``k`` to where a tag that is seen in the stands on both sides shows it.
+
+    What odometry says of the step stays as it is: this is where the problem is linear, and takes no information.
+    """
+    ref_from_begin, covariance = found.steps[k]
+    # The tag that more is seen of on the side where less is seen of it
+    ranked = [(min(len(_seen_from(found, tag, side)) for side in stands), index) for index, tag in enumerate(tags)]
+    count, best = max(ranked, default=(0, 0))
+    if not count:
+        return found
+    before, after = (_seen_from(found, tags[best], side) for side in stands)
+    size_m = tags[best].size_m
+    error = jump_between(before, after, size_m=size_m, ref_from_begin=ref_from_begin, covariance=covariance)
+    moved = move(ref_from_begin, error)
+    places = {
+        id(p): dataclasses.replace(p, ref_from_body=moved * p.ref_from_body) if p.stand <= k else p
+        for p in found.places
+    }
+    return dataclasses.replace(
+        found,
+        places=tuple(places.values()),
+        sightings=tuple(dataclasses.replace(s, place=places[id(s.place)]) for s in found.sightings),
+        steps=tuple((moved * pose if i < k else pose, c) for i, (pose, c) in enumerate(found.steps)),
+        step_means=tuple(-error if i == k else mean for i, mean in enumerate(found.step_means)),
+    )
+
+
+def _seen_from(found: BodySightings, tag: TagPose, stands: Sequence[int]) -> list[Sighting]:
+    return [
+        Sighting(s.detection, s.place.frame.camera, s.place.ref_from_cam, ARM_COVARIANCE)
+        for s in found.of(tag)
+        if s.place.stand in stands
+    ]
 
 
 def _stands(odom_from_body: Sequence[Pose]) -> tuple[list[int], list[int]]:

@@ -31,6 +31,9 @@ AGREES = float(chi2_law.ppf(0.9999, 6))
 UPRIGHT_RAD = math.radians(2.0)
 # Residuals widen the covariance where they exceed their noise beyond one in a hundred
 WIDEN = 0.99
+# Added to a tag's variances, in rad^2 and m^2, and as a share of them: a tag that is known exactly, or exactly along a
+# direction in rounded numbers, has a covariance without inverse
+EXACT, ROUNDED = 1e-12, 2e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,9 +127,10 @@ def _alone(
     found: BodySightings, seen: Sequence[BodySighting], tag: TagPose, arm: ArmNoise
 ) -> tuple[_Part, Pose, Array]:
     """Return the sightings of one tag that agree, the body that they show by themselves, and what a flip adds to it."""
-    total = image_covariance(arm)
+    total, stands = image_covariance(arm), [s.place.stand for s in seen]
+    home = max(sorted(set(stands), reverse=True), key=stands.count)
     sightings = [
-        Sighting(s.detection, s.place.frame.camera, s.place.ref_from_cam, total + _step_noise(s.place, found))
+        Sighting(s.detection, s.place.frame.camera, s.place.ref_from_cam, total + _step_noise(s.place, found, home))
         for s in seen
     ]
     fix = fuse_sightings(sightings, tag.size_m)
@@ -174,11 +178,11 @@ def tilt(map_from_body: Pose) -> float:
     return float(np.arccos(np.clip(map_from_body.rotation.as_matrix()[2, 2], -1.0, 1.0)))
 
 
-def _step_noise(place: Place, found: BodySightings) -> Array:
-    """Return the 6x6 covariance of a camera's place by the steps between it and the reference."""
+def _step_noise(place: Place, found: BodySightings, home: int) -> Array:
+    """Return the 6x6 covariance of a camera's place by the steps between it and the stand from which most is seen."""
     total = np.zeros((6, 6))
     cam_from_ref = place.ref_from_cam.inv()
-    for ref_from_begin, covariance in found.steps[place.stand :]:
+    for ref_from_begin, covariance in found.steps[min(place.stand, home) : max(place.stand, home)]:
         effect = adjoint(cam_from_ref * ref_from_begin)
         total += effect @ covariance @ effect.T
     return total
@@ -230,7 +234,7 @@ class _Problem:
 
     def __init__(self, found: BodySightings, parts: Sequence[_Part], arm: ArmNoise) -> None:
         self.parts, self.image = parts, image_covariance(arm)
-        self.steps = tuple(pose for pose, _ in found.steps)
+        self.steps, self.step_means = tuple(pose for pose, _ in found.steps), np.ravel(found.step_means)
         rows = [(k, s) for k, part in enumerate(parts) for s in part.sightings]
         self.tag_of = np.array([k for k, _ in rows])
         self.tags_at = 12 + 6 * len(self.steps)
@@ -242,7 +246,7 @@ class _Problem:
         self.points = np.stack([tag_corners(parts[k].tag.size_m) for k, _ in rows])
         self.xy = np.stack([s.place.frame.camera.unproject(s.detection.corners_px)[:, :2] for _, s in rows])
         self.lens = np.stack([_lens(s.place.frame.camera, xy) for (_, s), xy in zip(rows, self.xy, strict=True)])
-        self.variance = np.array([s.detection.sigma_px**2 for _, s in rows])[:, None, None] * np.eye(8)
+        self.variance = np.stack([s.detection.noise_px for _, s in rows])
         shared = _inverse(_diagonal(max(arm.camera_deg, 1e-5), max(arm.camera_m, 1e-7)))
         priors = [shared, *(_inverse(c) for _, c in found.steps), *(_tag_prior(p.tag) for p in parts)]
         self.prior = block_diag(np.zeros((6, 6)), *priors)
@@ -294,7 +298,7 @@ class _Problem:
 
     def _deviation(self, state: _State) -> Array:
         tags = [log(p.tag.map_from_tag.inv() * pose) for p, pose in zip(self.parts, state.map_from_tags, strict=True)]
-        return np.concatenate([np.zeros(6), state.shared, state.step_errors.ravel(), *tags])
+        return np.concatenate([np.zeros(6), state.shared, state.step_errors.ravel() - self.step_means, *tags])
 
     def minimise(self, state: _State, scale: float, *, iterations: int = 15) -> tuple[_State, Array, float, float]:
         """Return the state that minimises the weighted residuals, and normal matrix, chi-square and log determinant."""
@@ -319,7 +323,7 @@ class _Problem:
 
 def _tag_prior(tag: TagPose) -> Array:
     try:
-        return _inverse(tag.covariance)
+        return _inverse(tag.covariance * (1 + ROUNDED * np.eye(6)) + EXACT * np.eye(6))
     except np.linalg.LinAlgError as error:
         raise TagError(
             f"the covariance of tag {tag.id} is not positive definite; expected 36 numbers as calibration writes them",
