@@ -1,0 +1,252 @@
+"""What sightings say of a body whose tilt against a tag they hardly see: an integral instead of a linear model.
+
+A tag that faces the camera looks the same when it is slanted a little to one side or to the other, so the likelihood of
+its tilt is no Gaussian: two solutions, apart or merged. The two angles of the tilt are integrated over numerically;
+everything else is a Gaussian for each of them (Laplace's method).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fieldkit.frames import Array, Pose, adjoint
+from fieldkit.tags.joint import Problem, State, inverse
+
+# How far from upright a body may well stand, and the tag be calibrated: the odds between planar solutions
+UPRIGHT_RAD = math.radians(2.0)
+# Twice the log likelihood at two standard deviations of the tilt is 4; off by more than this, the linear model is left
+LINEAR = 0.4
+# Places of the integral per solution, and the degrees of freedom of Student's law that they are spread by
+COUNT, FREEDOM = 64, 4.0
+# Newton's steps at each of them, and what the next one may still gain in chi-square
+STEPS, SMALL = 5, 0.02
+# A tag is not seen from behind
+BEHIND_RAD = 2.5
+# Fewer places of weight than this are no integral
+ENOUGH = 6
+# A solution that is turned by less than this many standard deviations is no other one
+SAME = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Belief:
+    """States of body, hand camera (n, 6) and steps (n, s, 6) with weights (n,); the covariance about each of them."""
+
+    weights: Array
+    map_from_body: Pose
+    shared: Array
+    step_errors: Array
+    joint: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Other:
+    """The other planar solution's body, and the evidence (difference of chi-squares) against it.
+
+    Sightings from one direction repeat an error of lens or paper and are not as sure as they say all together: then the
+    evidence ``is_bound``, else they speak for themselves.
+    """
+
+    map_from_body: Pose
+    evidence: float
+    is_bound: bool
+
+
+def moments(poses: Pose, weights: Array) -> tuple[Pose, Array]:
+    """Return the mean of weighted poses (n) and their 6x6 covariance (right perturbation)."""
+    mean = poses[int(np.argmax(weights))]
+    if len(weights) == 1:
+        return mean, np.zeros((6, 6))
+    for _ in range(4):
+        deltas = _logs(mean.inv() * poses)
+        shift = weights @ deltas
+        mean = mean * Pose.from_components(shift[3:], Rotation.from_rotvec(shift[:3]))
+    deltas = _logs(mean.inv() * poses)
+    return mean, (deltas * weights[:, None]).T @ deltas
+
+
+def tilt(map_from_body: Pose) -> float:
+    """Return the angle (rad) between the body's z and the map's."""
+    return float(np.arccos(np.clip(map_from_body.rotation.as_matrix()[2, 2], -1.0, 1.0)))
+
+
+def believe(
+    problem: Problem, state: State, scale: float, *, normal: Array, factor: float, other: Other | None = None
+) -> Belief:
+    """Return what the sightings say about the state at their minimum: one Gaussian, or an integral over the tilt.
+
+    ``normal`` is the normal matrix there; ``factor`` divides chi-squares. Without another solution the linear model is
+    tested at two standard deviations of the tilt to either side. Upright bodies are preferred, but only between
+    solutions: not within one.
+    """
+    here = _Place(np.zeros(2), 0.0, state, inverse(normal) * factor)
+    linear = _belief([here], np.ones(1), problem.tags_at)
+    try:
+        places = _Tilting(problem, state, scale, factor)
+        spread = places.spread(state, normal)
+        if other is None and places.is_linear(spread):
+            return linear
+        return _integrate(places, spread, other) or linear
+    except np.linalg.LinAlgError:
+        return linear
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """A tilt, twice its negative log likelihood (rest integrated over), the state of all else and its covariance."""
+
+    tilt: Array
+    cost: float
+    state: State
+    covariance: Array
+
+
+class _Tilting:
+    """The likelihood of the tilt: a turn of the body about axes in the plane of a tag, as a rotation vector (2,)."""
+
+    def __init__(self, problem: Problem, state: State, scale: float, factor: float) -> None:
+        self.problem, self.scale, self.factor = problem, scale, factor
+        self.origin = state
+        self.map_from_tag = problem.parts[0].tag.map_from_tag
+
+    def at(self, turn: Array, state: State | None = None) -> _Place:
+        """Minimise over all else at a tilt, from a state at it; the cost is infinite where there is no minimum."""
+        if state is None:
+            turned = Pose.from_rotation(Rotation.from_rotvec([*turn, 0.0]))
+            body = self.map_from_tag * turned * self.map_from_tag.inv() * self.origin.map_from_body
+            state = dataclasses.replace(self.origin, map_from_body=body)
+        try:
+            return self._minimise(turn, state)
+        except np.linalg.LinAlgError:
+            return _Place(turn, math.inf, state, np.zeros((self.problem.n_unknown, self.problem.n_unknown)))
+
+    def _minimise(self, turn: Array, state: State) -> _Place:
+        for _ in range(STEPS):
+            normal, gradient, total, logdet = self.problem.normal(state, self.scale)
+            free = self._free(state)
+            rest = free.T @ normal @ free
+            step = np.linalg.solve(rest, free.T @ gradient)
+            gain = float(step @ rest @ step)
+            if gain < SMALL * self.factor:
+                break
+            state = state.moved(free @ step)
+        covariance = free @ inverse(rest) @ free.T * self.factor
+        # Directions of the paper's normal are alike: the measure on the sphere
+        angle = float(np.linalg.norm(turn))
+        sphere = math.log(np.sinc(angle / math.pi)) if angle < BEHIND_RAD else -math.inf
+        cost = (total - gain) / self.factor + logdet + float(np.linalg.slogdet(rest)[1]) - 2 * sphere
+        return _Place(turn, cost if np.isfinite(cost) and gain < 1.0 else math.inf, state, covariance)
+
+    def spread(self, state: State, normal: Array) -> Array:
+        """Return the 2x2 covariance of the tilt in the linear model."""
+        by_body = adjoint(self.map_from_tag.inv() * state.map_from_body)[:2]
+        covariance: Array = by_body @ inverse(normal)[:6, :6] @ by_body.T * self.factor
+        return covariance
+
+    def is_linear(self, spread: Array) -> bool:
+        """Tell whether the likelihood at two standard deviations to either side is that of the linear model."""
+        values, axes = np.linalg.eigh(spread)
+        here = self.at(np.zeros(2)).cost
+        turns = [sign * 2 * math.sqrt(v) * axis for v, axis in zip(values, axes.T, strict=True) for sign in (-1, 1)]
+        return all(abs(self.at(turn).cost - here - 4) < LINEAR for turn in turns)
+
+    def turn_to(self, map_from_body: Pose) -> Array:
+        """Return the tilt at which a body stands."""
+        here, there = (self.map_from_tag.inv() * b for b in (self.origin.map_from_body, map_from_body))
+        x, y, z = (here * there.inv()).rotation.as_matrix()[:, 2]
+        angle = math.atan2(math.hypot(x, y), z)
+        return angle / max(math.hypot(x, y), 1e-12) * np.array([y, -x])
+
+    def _free(self, state: State) -> Array:
+        """Return the directions (u, u - 2) of the unknowns that leave the tilt as it is."""
+        n = self.problem.n_unknown
+        free = np.zeros((n, n - 2))
+        free[:6, :4] = adjoint(state.map_from_body.inv() * self.map_from_tag)[:, 2:]
+        free[6:, 4:] = np.eye(n - 6)
+        return free
+
+
+def _integrate(places: _Tilting, spread: Array, other: Other | None) -> Belief | None:
+    """Return the weighted places of an importance sample of one or two solutions; None where too few of them count."""
+    second = None if other is None else _second(places, other)
+    modes = [(np.zeros(2), spread)] if second is None else [(np.zeros(2), spread), second]
+    turns = np.concatenate([centre + _students(cov) for centre, cov in modes])
+    density = np.stack([_density(turns - centre, cov) for centre, cov in modes])
+    found, owner = [places.at(turn) for turn in turns], density.argmax(axis=0)
+    cost = np.array([p.cost for p in found])
+    if not np.isfinite(cost.min()):
+        return None
+    weights = np.exp(-(cost - cost.min()) / 2) / density.sum(axis=0)
+    if other is not None:
+        if second is None and other.is_bound:
+            # All together show no second solution, but single ones do
+            found.append(places.at(places.turn_to(other.map_from_body), places.problem.start(other.map_from_body)))
+            weights = np.append(weights, weights.sum() * math.exp(-other.evidence / 2))
+            owner = np.append(owner, 1)
+        tilts = np.array([tilt(p.state.map_from_body) for p in found])
+        weights = _between(weights, owner, tilts, abs(other.evidence) if other.is_bound else math.inf)
+    weights /= weights.sum()
+    if 1.0 / float(weights @ weights) < ENOUGH:
+        return None
+    kept = np.flatnonzero(weights > 1e-5)
+    return _belief([found[i] for i in kept], weights[kept] / weights[kept].sum(), places.problem.tags_at)
+
+
+def _belief(found: Sequence[_Place], weights: Array, known: int) -> Belief:
+    return Belief(
+        weights,
+        Pose.concatenate([p.state.map_from_body for p in found]),
+        np.stack([p.state.shared for p in found]),
+        np.stack([p.state.step_errors for p in found]),
+        np.einsum("n,nij->ij", weights, np.stack([p.covariance[:known, :known] for p in found])),
+    )
+
+
+def _second(places: _Tilting, other: Other) -> tuple[Array, Array] | None:
+    """Return tilt and 2x2 covariance of the other solution; None where it has merged into the first."""
+    start = places.problem.start(other.map_from_body)
+    state, normal, _, _ = places.problem.minimise(start, places.scale)
+    turn = places.turn_to(state.map_from_body)
+    spread = places.spread(state, normal)
+    if float(turn @ np.linalg.solve(spread, turn)) < SAME**2:
+        return None
+    return turn, spread
+
+
+def _between(weights: Array, owner: Array, tilts: Array, evidence: float) -> Array:
+    """Return weights with odds between two solutions of no more evidence than allowed, and of how upright they are."""
+    mass = np.array([weights[owner == k].sum() for k in range(2)])
+    if not (mass > 0).all():
+        return weights
+    odds = np.clip(math.log(mass[1] / mass[0]), -evidence / 2, evidence / 2)
+    upright = weights * np.exp(-((tilts / UPRIGHT_RAD) ** 2) / 2)
+    odds += math.log(max(upright[owner == 1].sum(), 1e-300) / mass[1])
+    odds -= math.log(max(upright[owner == 0].sum(), 1e-300) / mass[0])
+    share = 1.0 / (1.0 + math.exp(-np.clip(odds, -40, 40)))
+    result: Array = weights * np.where(owner == 1, share / mass[1], (1 - share) / mass[0])
+    return result
+
+
+def _students(covariance: Array) -> Array:
+    """Return points (COUNT, 2) evenly spread by Student's law: Roberts' sequence, which is the same every time."""
+    golden = 1.32471795724474602596
+    u, v = ((0.5 + np.arange(1, COUNT + 1)[:, None] / golden ** np.array([1, 2])) % 1.0).T
+    radius = np.sqrt(FREEDOM * ((1 - u) ** (-2 / FREEDOM) - 1))
+    circle = radius[:, None] * np.column_stack([np.cos(2 * np.pi * v), np.sin(2 * np.pi * v)])
+    result: Array = circle @ np.linalg.cholesky(covariance).T
+    return result
+
+
+def _density(delta: Array, covariance: Array) -> Array:
+    square = np.einsum("ni,ni->n", delta, np.linalg.solve(covariance, delta.T).T)
+    result: Array = (1 + square / FREEDOM) ** (-(FREEDOM + 2) / 2) / math.sqrt(np.linalg.det(covariance))
+    return result
+
+
+def _logs(poses: Pose) -> Array:
+    return np.concatenate([poses.rotation.as_rotvec(), poses.translation], axis=1)
