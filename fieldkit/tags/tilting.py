@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fieldkit.frames import Array, Pose, adjoint
@@ -21,6 +22,8 @@ from fieldkit.tags.joint import Problem, State, inverse
 UPRIGHT_RAD = math.radians(2.0)
 # Twice the log likelihood at two standard deviations of the tilt is 4; off by more than this, the linear model is left
 LINEAR = 0.4
+# Twice the log likelihood by which the mirrored tilt has to be worse not to count
+UNLIKELY = 16.0
 # Places of the integral per solution, and the degrees of freedom of Student's law that they are spread by
 COUNT, FREEDOM = 64, 4.0
 # Newton's steps at each of them, and what the next one may still gain in chi-square
@@ -81,8 +84,8 @@ def believe(
     """Return what the sightings say about the state at their minimum: one Gaussian, or an integral over the tilt.
 
     ``normal`` is the normal matrix there; ``factor`` divides chi-squares. Without another solution the linear model is
-    tested at two standard deviations of the tilt to either side. Upright bodies are preferred, but only between
-    solutions: not within one.
+    tested at two standard deviations of the tilt to either side and at the mirrored tilt. Upright bodies are preferred,
+    but only between solutions: not within one.
     """
     here = _Place(np.zeros(2), 0.0, state, inverse(normal) * factor)
     linear = _belief([here], np.ones(1), problem.tags_at)
@@ -149,18 +152,27 @@ class _Tilting:
         return covariance
 
     def is_linear(self, spread: Array) -> bool:
-        """Tell whether the likelihood at two standard deviations to either side is that of the linear model."""
+        """Tell whether the likelihood is that of the linear model: at two standard deviations, and where mirrored."""
         values, axes = np.linalg.eigh(spread)
         here = self.at(np.zeros(2)).cost
         turns = [sign * 2 * math.sqrt(v) * axis for v, axis in zip(values, axes.T, strict=True) for sign in (-1, 1)]
-        return all(abs(self.at(turn).cost - here - 4) < LINEAR for turn in turns)
+        if any(abs(self.at(turn).cost - here - 4) > LINEAR for turn in turns):
+            return False
+        mirrored = self.mirrored()
+        return _is_same(mirrored, spread) or self.at(mirrored).cost - here > UNLIKELY
 
     def turn_to(self, map_from_body: Pose) -> Array:
         """Return the tilt at which a body stands."""
         here, there = (self.map_from_tag.inv() * b for b in (self.origin.map_from_body, map_from_body))
-        x, y, z = (here * there.inv()).rotation.as_matrix()[:, 2]
-        angle = math.atan2(math.hypot(x, y), z)
-        return angle / max(math.hypot(x, y), 1e-12) * np.array([y, -x])
+        return _turn((here * there.inv()).rotation.as_matrix()[:, 2])
+
+    def mirrored(self) -> Array:
+        """Return the tilt that would look the same without perspective: mirrored at the mean direction of the views."""
+        cams = self.origin.map_from_body * self.problem.ref_from_body * self.problem.body_from_cam
+        views = (self.map_from_tag.inv() * cams).translation
+        view = (views / np.linalg.norm(views, axis=1, keepdims=True)).mean(axis=0)
+        view /= np.linalg.norm(view)
+        return _turn(2 * view[2] * view - [0.0, 0.0, 1.0])
 
     def _free(self, state: State) -> Array:
         """Return the directions (u, u - 2) of the unknowns that leave the tilt as it is."""
@@ -173,26 +185,32 @@ class _Tilting:
 
 def _integrate(places: _Tilting, spread: Array, other: Other | None) -> Belief | None:
     """Return the weighted places of an importance sample of one or two solutions; None where too few of them count."""
-    second = None if other is None else _second(places, other)
-    modes = [(np.zeros(2), spread)] if second is None else [(np.zeros(2), spread), second]
+    second, mirrored = None if other is None else _second(places, other), places.mirrored()
+    modes = [(np.zeros(2), spread)]
+    if second is not None:
+        modes.append(second)
+    elif not _is_same(mirrored, spread):
+        # Merged to a shoulder of the first
+        modes.append((mirrored, spread))
     turns = np.concatenate([centre + _students(cov) for centre, cov in modes])
     density = np.stack([_density(turns - centre, cov) for centre, cov in modes])
-    found, owner = [places.at(turn) for turn in turns], density.argmax(axis=0)
+    found = [places.at(turn) for turn in turns]
     cost = np.array([p.cost for p in found])
     if not np.isfinite(cost.min()):
         return None
     weights = np.exp(-(cost - cost.min()) / 2) / density.sum(axis=0)
-    if other is not None:
-        if second is None and other.is_bound:
-            # All together show no second solution, but single ones do
-            found.append(places.at(places.turn_to(other.map_from_body), places.problem.start(other.map_from_body)))
-            weights = np.append(weights, weights.sum() * math.exp(-other.evidence / 2))
-            owner = np.append(owner, 1)
-        tilts = np.array([tilt(p.state.map_from_body) for p in found])
-        weights = _between(weights, owner, tilts, abs(other.evidence) if other.is_bound else math.inf)
     weights /= weights.sum()
     if 1.0 / float(weights @ weights) < ENOUGH:
         return None
+    if other is not None and (second is not None or other.is_bound):
+        owner = density.argmax(axis=0) if second is not None else np.zeros(len(found), dtype=np.intp)
+        if second is None:
+            # All together show no second solution, but single ones do
+            found.append(places.at(places.turn_to(other.map_from_body), places.problem.start(other.map_from_body)))
+            weights = np.append(weights, math.exp(-other.evidence / 2))
+            owner = np.append(owner, 1)
+        tilts = np.array([tilt(p.state.map_from_body) for p in found])
+        weights = _between(weights, owner, tilts, abs(other.evidence) if other.is_bound else math.inf)
     kept = np.flatnonzero(weights > 1e-5)
     return _belief([found[i] for i in kept], weights[kept] / weights[kept].sum(), places.problem.tags_at)
 
@@ -213,12 +231,21 @@ def _second(places: _Tilting, other: Other) -> tuple[Array, Array] | None:
     state, normal, _, _ = places.problem.minimise(start, places.scale)
     turn = places.turn_to(state.map_from_body)
     spread = places.spread(state, normal)
-    if float(turn @ np.linalg.solve(spread, turn)) < SAME**2:
-        return None
-    return turn, spread
+    return None if _is_same(turn, spread) else (turn, spread)
 
 
-def _between(weights: Array, owner: Array, tilts: Array, evidence: float) -> Array:
+def _is_same(turn: Array, spread: Array) -> bool:
+    return float(turn @ np.linalg.solve(spread, turn)) < SAME**2
+
+
+def _turn(normal: Array) -> Array:
+    """Return the turn (2,) of a body about a tag after which the tag's normal is seen where this one (3,) was."""
+    x, y, z = normal
+    across = math.hypot(x, y)
+    return math.atan2(across, z) / max(across, 1e-12) * np.array([y, -x])
+
+
+def _between(weights: Array, owner: NDArray[np.intp], tilts: Array, evidence: float) -> Array:
     """Return weights with odds between two solutions of no more evidence than allowed, and of how upright they are."""
     mass = np.array([weights[owner == k].sum() for k in range(2)])
     if not (mass > 0).all():
