@@ -21,7 +21,7 @@ from fieldkit.protocol import ArmNoise
 from fieldkit.tags.fusion import SCALES, Sighting, TagFix, fuse_sightings
 from fieldkit.tags.joint import Part, Problem, State, by_steps, by_unknowns, diagonal, image_covariance
 from fieldkit.tags.sightings import BodySighting, BodySightings, Place
-from fieldkit.tags.tilting import Belief, Other, believe, moments, tilt
+from fieldkit.tags.tilting import Belief, Other, believe, tilt
 from fieldkit.types import TagPose
 
 # Another tag joins in unless it contradicts the named one beyond one in ten thousand (6 degrees of freedom)
@@ -56,7 +56,7 @@ class BodyFix:
         belief = self.belief
         moved = belief.step_errors.reshape(len(belief.weights), -1) @ by_steps(place, self.steps).T
         body = belief.map_from_body * place.ref_from_body * _exps(moved)
-        cam, spread = moments(body * place.body_from_cam * _exps(belief.shared), belief.weights)
+        cam, spread = belief.moments(body * place.body_from_cam * _exps(belief.shared))
         by_unknown = by_unknowns(place, self.steps)
         covariance = by_unknown @ belief.joint @ by_unknown.T + spread + self.scale**2 * self.image_covariance
         return cam, (covariance + covariance.T) / 2
@@ -181,7 +181,7 @@ def _solve(
             "squares of the given sizes",
             hint="check size_m of the tag and the camera's calibration",
         ) from error
-    mean, spread = moments(belief.map_from_body, belief.weights)
+    mean, spread = belief.moments(belief.map_from_body)
     return BodyFix(
         found.t_ns,
         mean,

@@ -14,12 +14,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
 
 from fieldkit.frames import Array, Pose, adjoint
 from fieldkit.tags.joint import Problem, State, inverse
 
-# How far from upright a body may well stand, and the tag be calibrated: the odds between planar solutions
-UPRIGHT_RAD = math.radians(2.0)
+# How far from upright a body may well stand, and the tag be calibrated: the odds between planar solutions. One robot in
+# so many stands on a slope, or its body's z is not up
+UPRIGHT_RAD, ASLANT = math.radians(2.0), 1e-4
 # Twice the log likelihood at two standard deviations of the tilt is 4; off by more than this, the linear model is left
 LINEAR = 0.4
 # Twice the log likelihood by which the mirrored tilt has to be worse not to count
@@ -38,13 +40,31 @@ SAME = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class Belief:
-    """States of body, hand camera (n, 6) and steps (n, s, 6) with weights (n,); the covariance about each of them."""
+    """States of body, hand camera (n, 6) and steps (n, s, 6) with weights (n,); the covariance about each of them.
+
+    ``chosen`` (n,) are the weights of the solution that is taken, where two stay open, else the same.
+    """
 
     weights: Array
+    chosen: Array
     map_from_body: Pose
     shared: Array
     step_errors: Array
     joint: Array
+
+    def moments(self, poses: Pose) -> tuple[Pose, Array]:
+        """Return the mean of poses (n) of the states over the solution that is taken, and 6x6 second moments about it.
+
+        The moments are over both solutions, without the covariance about each state.
+        """
+        mean = poses[int(np.argmax(self.chosen))]
+        if len(poses) == 1:
+            return mean, np.zeros((6, 6))
+        for _ in range(4):
+            shift = self.chosen @ _logs(mean.inv() * poses)
+            mean = mean * Pose.from_components(shift[3:], Rotation.from_rotvec(shift[:3]))
+        deltas = _logs(mean.inv() * poses)
+        return mean, (deltas * self.weights[:, None]).T @ deltas
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,19 +78,6 @@ class Other:
     map_from_body: Pose
     evidence: float
     is_bound: bool
-
-
-def moments(poses: Pose, weights: Array) -> tuple[Pose, Array]:
-    """Return the mean of weighted poses (n) and their 6x6 covariance (right perturbation)."""
-    mean = poses[int(np.argmax(weights))]
-    if len(weights) == 1:
-        return mean, np.zeros((6, 6))
-    for _ in range(4):
-        deltas = _logs(mean.inv() * poses)
-        shift = weights @ deltas
-        mean = mean * Pose.from_components(shift[3:], Rotation.from_rotvec(shift[:3]))
-    deltas = _logs(mean.inv() * poses)
-    return mean, (deltas * weights[:, None]).T @ deltas
 
 
 def tilt(map_from_body: Pose) -> float:
@@ -88,7 +95,7 @@ def believe(
     but only between solutions: not within one.
     """
     here = _Place(np.zeros(2), 0.0, state, inverse(normal) * factor)
-    linear = _belief([here], np.ones(1), problem.tags_at)
+    linear = _belief([here], np.ones(1), np.zeros(1, dtype=np.intp), known=problem.tags_at)
     try:
         places = _Tilting(problem, state, scale, factor)
         spread = places.spread(state, normal)
@@ -198,30 +205,33 @@ def _integrate(places: _Tilting, spread: Array, other: Other | None) -> Belief |
     cost = np.array([p.cost for p in found])
     if not np.isfinite(cost.min()):
         return None
-    weights = np.exp(-(cost - cost.min()) / 2) / density.sum(axis=0)
-    weights /= weights.sum()
+    logs = (cost.min() - cost) / 2 - np.log(density.sum(axis=0))
+    weights = _normalised(logs)
     if 1.0 / float(weights @ weights) < ENOUGH:
         return None
-    if other is not None and (second is not None or other.is_bound):
-        owner = density.argmax(axis=0) if second is not None else np.zeros(len(found), dtype=np.intp)
-        if second is None:
-            # All together show no second solution, but single ones do
-            found.append(places.at(places.turn_to(other.map_from_body), places.problem.start(other.map_from_body)))
-            weights = np.append(weights, math.exp(-other.evidence / 2))
-            owner = np.append(owner, 1)
+    owner = density.argmax(axis=0) if other is not None and second is not None else np.zeros(len(found), dtype=np.intp)
+    if other is not None and second is None and other.is_bound:
+        # All together show no second solution, but single ones do
+        found.append(places.at(places.turn_to(other.map_from_body), places.problem.start(other.map_from_body)))
+        logs = np.append(logs, logsumexp(logs) - other.evidence / 2)
+        owner = np.append(owner, 1)
+    if other is not None and owner.any():
         tilts = np.array([tilt(p.state.map_from_body) for p in found])
-        weights = _between(weights, owner, tilts, abs(other.evidence) if other.is_bound else math.inf)
+        weights = _between(logs, owner, tilts, abs(other.evidence) if other.is_bound else math.inf)
+    return _belief(found, weights, owner, known=places.problem.tags_at)
+
+
+def _belief(found: Sequence[_Place], weights: Array, owner: NDArray[np.intp], *, known: int) -> Belief:
     kept = np.flatnonzero(weights > 1e-5)
-    return _belief([found[i] for i in kept], weights[kept] / weights[kept].sum(), places.problem.tags_at)
-
-
-def _belief(found: Sequence[_Place], weights: Array, known: int) -> Belief:
+    places, weights, owner = [found[int(i)] for i in kept], weights[kept] / weights[kept].sum(), owner[kept]
+    chosen = np.where(owner == (weights[owner == 1].sum() > 0.5), weights, 0.0)
     return Belief(
         weights,
-        Pose.concatenate([p.state.map_from_body for p in found]),
-        np.stack([p.state.shared for p in found]),
-        np.stack([p.state.step_errors for p in found]),
-        np.einsum("n,nij->ij", weights, np.stack([p.covariance[:known, :known] for p in found])),
+        chosen / chosen.sum(),
+        Pose.concatenate([p.state.map_from_body for p in places]),
+        np.stack([p.state.shared for p in places]),
+        np.stack([p.state.step_errors for p in places]),
+        np.einsum("n,nij->ij", weights, np.stack([p.covariance[:known, :known] for p in places])),
     )
 
 
@@ -245,17 +255,29 @@ def _turn(normal: Array) -> Array:
     return math.atan2(across, z) / max(across, 1e-12) * np.array([y, -x])
 
 
-def _between(weights: Array, owner: NDArray[np.intp], tilts: Array, evidence: float) -> Array:
-    """Return weights with odds between two solutions of no more evidence than allowed, and of how upright they are."""
-    mass = np.array([weights[owner == k].sum() for k in range(2)])
-    if not (mass > 0).all():
-        return weights
-    odds = np.clip(math.log(mass[1] / mass[0]), -evidence / 2, evidence / 2)
-    upright = weights * np.exp(-((tilts / UPRIGHT_RAD) ** 2) / 2)
-    odds += math.log(max(upright[owner == 1].sum(), 1e-300) / mass[1])
-    odds -= math.log(max(upright[owner == 0].sum(), 1e-300) / mass[0])
-    share = 1.0 / (1.0 + math.exp(-np.clip(odds, -40, 40)))
-    result: Array = weights * np.where(owner == 1, share / mass[1], (1 - share) / mass[0])
+def _between(logs: Array, owner: NDArray[np.intp], tilts: Array, evidence: float) -> Array:
+    """Return weights with odds between two solutions of no more evidence than allowed, and of how upright they are.
+
+    ``logs`` (n,) are logarithms of weights, ``owner`` (n,) the solution of each, ``tilts`` (n,) how far it is from
+    upright in rad. How upright a solution is does not change the weights within it.
+    """
+    upright = logs + np.logaddexp(-((tilts / UPRIGHT_RAD) ** 2) / 2, math.log(ASLANT))
+    mass = np.array([_log_sum(logs[owner == k]) for k in range(2)])
+    stands = np.array([_log_sum(upright[owner == k]) for k in range(2)]) - mass
+    if not np.isfinite(mass).all():
+        return _normalised(logs)
+    odds = float(np.clip(mass[1] - mass[0], -evidence / 2, evidence / 2) + stands[1] - stands[0])
+    share = -np.logaddexp(0.0, [odds, -odds])
+    return _normalised(logs + (share - mass)[owner])
+
+
+def _log_sum(logs: Array) -> float:
+    return float(logsumexp(logs)) if len(logs) else -math.inf
+
+
+def _normalised(logs: Array) -> Array:
+    weights = np.exp(logs - logs.max())
+    result: Array = weights / weights.sum()
     return result
 
 
