@@ -229,10 +229,10 @@ def test_one_sighting_is_enough_and_its_body_stands_upright() -> None:
 STILL = ArmNoise(image_deg=1e-4, image_m=1e-6, camera_deg=0, camera_m=0, base_deg=0, base_m=0)
 
 
-def seen_once(slant_rad: float) -> tuple[Standing, TagPose, Pose, Array]:
+def seen_once(slant_rad: float, distance_m: float) -> tuple[Standing, TagPose, Pose, Array]:
     """Return a robot before a tag that is turned about its upright axis, cam_from_tag, and the corners, noise drawn."""
     scene = stand(np.random.default_rng(0), Settings(n_start=1, walk_m=0.0))
-    cam_from_tag = Pose.from_components([0.02, -0.03, 1.7], Rotation.from_euler("yx", [slant_rad, math.pi]))
+    cam_from_tag = Pose.from_components([0.02, -0.03, distance_m], Rotation.from_euler("yx", [slant_rad, math.pi]))
     corners, _ = CAMERA.project(cam_from_tag.apply(tag_corners(SIZE_M)))
     corners += 0.2 * np.random.default_rng(5).normal(size=(4, 2))
     body = yaw_pose([0.0, 0.0, 0.0], 0.3)
@@ -250,7 +250,7 @@ def seen_once(slant_rad: float) -> tuple[Standing, TagPose, Pose, Array]:
 
 def normals_by_grid(cam_from_tag: Pose, xy: Array) -> tuple[Array, Array]:
     """Return mean and covariance of the tag's normal in the camera, from the likelihood on a fine grid of tilts."""
-    side = np.radians(np.linspace(-45, 45, 181))
+    side = np.radians(np.linspace(-45, 45, 121))
     tilts = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     turned = cam_from_tag.rotation * Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))]))
     rest = np.tile([0.0, *cam_from_tag.translation], (len(tilts), 1))
@@ -274,21 +274,26 @@ def normals_by_grid(cam_from_tag: Pose, xy: Array) -> tuple[Array, Array]:
     return mean, ((normals - mean) * weights[:, None]).T @ (normals - mean)
 
 
-@pytest.mark.parametrize("slant_deg", [2.0, 8.0, 16.0])
-def test_a_tilt_that_is_hardly_seen_has_the_moments_of_its_likelihood(slant_deg: float) -> None:
-    """Merged solutions, two that stay open, and one that the perspective decides: as on a fine grid of tilts."""
-    scene, tag, cam_from_tag, xy = seen_once(math.radians(slant_deg))
+@pytest.mark.parametrize(("slant_deg", "distance_m"), [(2.0, 1.7), (8.0, 1.7), (16.0, 1.7), (20.0, 3.5)])
+def test_a_tilt_that_is_hardly_seen_has_the_moments_of_its_likelihood(slant_deg: float, distance_m: float) -> None:
+    """Solutions that merged, a shoulder, two that the perspective decides, two that stay open: as on a fine grid."""
+    scene, tag, cam_from_tag, xy = seen_once(math.radians(slant_deg), distance_m)
     found = body_sightings(scene.recording.frames, [tag], odometry=scene.recording.odometry, noise=NOISE)
     fix = locate_body(found, tag, arm=STILL)
+    assert len(fix.belief.weights) > 10
     cam, covariance = fix.map_from_cam(found.places[0])
     mean, expected = normals_by_grid(cam_from_tag, xy)
     normal = (cam.inv() * tag.map_from_tag).rotation.as_matrix()[:, 2]
+    is_open = bool((fix.belief.chosen == 0).any())
+    assert is_open == (distance_m > 3)
+    if not is_open:
+        assert np.linalg.norm(normal - mean / np.linalg.norm(mean)) < 0.05 * math.sqrt(np.trace(expected))
     by_turn = np.array([[0, -normal[2], normal[1]], [normal[2], 0, -normal[0]], [-normal[1], normal[0], 0]])
     stated = by_turn @ covariance[:3, :3] @ by_turn.T
-    assert len(fix.belief.weights) > 10
-    assert np.linalg.norm(normal - mean / np.linalg.norm(mean)) < 0.05 * math.sqrt(np.trace(expected))
-    sigmas = (np.sqrt(np.linalg.eigvalsh(c)[1:]) for c in (stated, expected))
-    np.testing.assert_allclose(*sigmas, rtol=0.03)
+    about = expected + np.outer(mean - normal, mean - normal)
+    sigmas = [np.sqrt(np.linalg.eigvalsh(c)[1:]) for c in (stated, about)]
+    # A flip by 40 deg is no small angle
+    np.testing.assert_allclose(*sigmas, rtol=0.1 if is_open else 0.03)
 
 
 def test_sightings_that_know_the_tilt_keep_the_linear_model() -> None:
