@@ -98,7 +98,8 @@ def test_uncertainty_grows_in_proportion_to_the_path() -> None:
     _, long, four = travel(straight(4.0), 0, 10 * SECOND, noise=NOISE)
     assert (one, four) == pytest.approx((1.0, 4.0))
     assert long[2, 2] == pytest.approx(16 * short[2, 2])
-    assert long[3, 3] == pytest.approx(16 * short[3, 3])
+    # A yaw of 2 deg takes less than a thousandth off the way
+    assert long[3, 3] == pytest.approx(16 * short[3, 3], rel=1e-3)
     # A yaw error at every metre of 4 m moves the end sideways by half of 4 m times its sum
     yaw, sideways = math.sqrt(long[2, 2]), math.sqrt(long[4, 4] - long[3, 3])
     assert yaw == pytest.approx(math.radians(0.5) * 4)
@@ -124,6 +125,29 @@ def test_covariance_of_travel_is_that_of_simulated_drift() -> None:
     simulated = np.cov(np.array(ends).T)
     for i in (2, 3, 4):
         assert math.sqrt(simulated[i, i]) == pytest.approx(math.sqrt(covariance[i, i]), rel=0.25)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.8])
+def test_covariance_of_a_long_way_holds_beyond_the_linear_model(turn: float) -> None:
+    """A yaw bias of 20 deg at the end of 40 m: the second moments are those of drawn ways, along it as well."""
+    turned, slanted = np.linspace(0, turn, 401), exp([0.05, -0.1, 0, 3.0, -2.0, 1.0])
+    moved = 0.1 * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    poses = [yaw_pose([*xy, 0.0], yaw) for xy, yaw in zip(np.cumsum(moved, axis=0), turned, strict=True)]
+    odometry = Trajectory(np.arange(401) * SECOND // 10, tuple(slanted * p for p in poses), "odom", "body")
+    noise = OdometryNoise(position_per_m=1e-9, position_per_root_m=0, yaw_deg_per_root_m=1.0)
+    _, covariance, _ = travel(odometry, 0, 40 * SECOND, noise=noise)
+    rng = np.random.default_rng(0)
+    yaw = np.radians(rng.normal(0, 0.5 * 0.1, (4000, 1)) + rng.normal(0, math.sqrt(0.1), (4000, 400))).cumsum(axis=1)
+    yaw += noise.yaw_deg_per_turn_deg * rng.normal(size=(4000, 1)) * (turned[1:] - turned[0])
+    steps = moved[1:] @ np.array([1.0, 1.0j])
+    error = ((np.exp(1j * yaw) - 1) * steps).sum(axis=1) * np.exp(-1j * turn)
+    drawn = np.stack([yaw[:, -1], error.real, error.imag])
+    moments, here = drawn @ drawn.T / 4000, covariance[np.ix_([2, 3, 4], [2, 3, 4])]
+    scale = np.sqrt(np.outer(np.diag(moments), np.diag(moments)))
+    np.testing.assert_allclose(here / scale, moments / scale, atol=0.05)
+    # What the linear model leaves out: the way along x, here by more than half a metre
+    assert math.sqrt(here[1, 1]) > 0.5
+    assert (np.linalg.eigvalsh(covariance) > -1e-12).all()
 
 
 def test_jitter_while_standing_is_no_path() -> None:

@@ -7,16 +7,17 @@ import math
 
 import numpy as np
 import pytest
-from standing_scenes import SECOND, Settings, Standing, stand
+from scipy.spatial.transform import Rotation
+from standing_scenes import CAMERA, SECOND, SIZE_M, Settings, Standing, stand
 
 from fieldkit.errors import PriorError, TruthError
 from fieldkit.frames import Array, Pose, Trajectory, adjoint, exp, log, pose_error, skew, yaw_pose
 from fieldkit.odometry import find_faults
 from fieldkit.prior import estimate_prior
 from fieldkit.protocol import ArmNoise, OdometryNoise
-from fieldkit.tags import body_sightings, locate_body
+from fieldkit.tags import body_sightings, locate_body, tag_corners
 from fieldkit.truth import estimate_truths
-from fieldkit.types import Prior, SeenTag, Truth
+from fieldkit.types import Prior, SeenTag, TagPose, Truth
 
 NOISE, ARM = OdometryNoise(), ArmNoise()
 
@@ -299,7 +300,7 @@ def test_corners_count_with_their_full_covariance() -> None:
         )
         cam_from_tag = (fix.map_from_body * s.place.ref_from_cam).inv() * tag.map_from_tag
         by_cam = adjoint(s.place.ref_from_cam.inv())
-        in_cam = by_cam @ fix.joint[:6, :6] @ by_cam.T
+        in_cam = by_cam @ fix.belief.joint[:6, :6] @ by_cam.T
         lever = np.hstack([skew(cam_from_tag.translation), -np.eye(3)])
         across = (lever @ in_cam @ lever.T)[:2, :2]
         return float(np.sqrt(np.linalg.eigvalsh(across)[0]))
@@ -329,3 +330,81 @@ def test_one_sighting_is_enough_and_its_body_stands_upright() -> None:
     fix = locate_body(found, tag, arm=ARM)
     assert fix.used == {1: 1}
     assert fix.map_from_body.rotation.as_matrix()[2, 2] > 0.99
+
+
+STILL = ArmNoise(image_deg=1e-4, image_m=1e-6, camera_deg=0, camera_m=0, base_deg=0, base_m=0)
+
+
+def seen_once(slant_rad: float, distance_m: float) -> tuple[Standing, TagPose, Pose, Array]:
+    """Return a robot before a tag that is turned about its upright axis, cam_from_tag, and the corners, noise drawn."""
+    scene = stand(np.random.default_rng(0), Settings(n_start=1, walk_m=0.0))
+    cam_from_tag = Pose.from_components([0.02, -0.03, distance_m], Rotation.from_euler("yx", [slant_rad, math.pi]))
+    corners, _ = CAMERA.project(cam_from_tag.apply(tag_corners(SIZE_M)))
+    corners += 0.2 * np.random.default_rng(5).normal(size=(4, 2))
+    body = yaw_pose([0.0, 0.0, 0.0], 0.3)
+    axes = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    body_from_cam = Pose.from_components([0.4, 0.0, 0.6], axes)
+    tag = dataclasses.replace(
+        scene.tags.tags[0], map_from_tag=body * body_from_cam * cam_from_tag, covariance=1e-12 * np.eye(6)
+    )
+    frame = scene.recording.frames[0]
+    seen = (SeenTag(tag.id, tag.family, corners, 0.2),)
+    frame = dataclasses.replace(frame, body_from_cam=body_from_cam, tags=seen)
+    recording = dataclasses.replace(scene.recording, frames=(frame,))
+    return dataclasses.replace(scene, recording=recording), tag, cam_from_tag, CAMERA.unproject(corners)[:, :2]
+
+
+def normals_by_grid(cam_from_tag: Pose, xy: Array) -> tuple[Array, Array]:
+    """Return mean and covariance of the tag's normal in the camera, from the likelihood on a fine grid of tilts."""
+    side = np.radians(np.linspace(-45, 45, 121))
+    tilts = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    turned = cam_from_tag.rotation * Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))]))
+    rest = np.tile([0.0, *cam_from_tag.translation], (len(tilts), 1))
+
+    def residuals(q: Array) -> Array:
+        about_z = Rotation.from_rotvec(q[:, :1] * [0.0, 0.0, 1.0])
+        x = np.einsum("nij,kj->nki", (turned * about_z).as_matrix(), tag_corners(SIZE_M)) + q[:, None, 1:]
+        return ((xy - x[..., :2] / x[..., 2:]) * CAMERA.focal_px / 0.2).reshape(len(q), 8)
+
+    for _ in range(6):
+        here = residuals(rest)
+        slope = np.stack([(residuals(rest + d) - here) / 1e-6 for d in 1e-6 * np.eye(4)], axis=-1)
+        normal = slope.transpose(0, 2, 1) @ slope
+        rest = rest - np.linalg.solve(normal, np.einsum("nai,na->ni", slope, here)[..., None])[..., 0]
+    angle = np.linalg.norm(tilts, axis=1)
+    cost = (residuals(rest) ** 2).sum(axis=1) + np.linalg.slogdet(normal)[1] - 2 * np.log(np.sinc(angle / np.pi))
+    weights = np.exp(-(cost - cost.min()) / 2)
+    weights /= weights.sum()
+    normals = turned.as_matrix()[..., 2]
+    mean = weights @ normals
+    return mean, ((normals - mean) * weights[:, None]).T @ (normals - mean)
+
+
+@pytest.mark.parametrize(("slant_deg", "distance_m"), [(2.0, 1.7), (8.0, 1.7), (16.0, 1.7), (20.0, 3.5)])
+def test_a_tilt_that_is_hardly_seen_has_the_moments_of_its_likelihood(slant_deg: float, distance_m: float) -> None:
+    """Solutions that merged, a shoulder, two that the perspective decides, two that stay open: as on a fine grid."""
+    scene, tag, cam_from_tag, xy = seen_once(math.radians(slant_deg), distance_m)
+    found = body_sightings(scene.recording.frames, [tag], odometry=scene.recording.odometry, noise=NOISE)
+    fix = locate_body(found, tag, arm=STILL)
+    assert len(fix.belief.weights) > 10
+    cam, covariance = fix.map_from_cam(found.places[0])
+    mean, expected = normals_by_grid(cam_from_tag, xy)
+    normal = (cam.inv() * tag.map_from_tag).rotation.as_matrix()[:, 2]
+    is_open = bool((fix.belief.chosen == 0).any())
+    assert is_open == (distance_m > 3)
+    if not is_open:
+        assert np.linalg.norm(normal - mean / np.linalg.norm(mean)) < 0.05 * math.sqrt(np.trace(expected))
+    by_turn = np.array([[0, -normal[2], normal[1]], [normal[2], 0, -normal[0]], [-normal[1], normal[0], 0]])
+    stated = by_turn @ covariance[:3, :3] @ by_turn.T
+    about = expected + np.outer(mean - normal, mean - normal)
+    sigmas = [np.sqrt(np.linalg.eigvalsh(c)[1:]) for c in (stated, about)]
+    # A flip by 40 deg is no small angle
+    np.testing.assert_allclose(*sigmas, rtol=0.1 if is_open else 0.03)
+
+
+def test_sightings_that_know_the_tilt_keep_the_linear_model() -> None:
+    scene = stand(np.random.default_rng(13), Settings(walk_m=0.0))
+    tag = scene.tags.tags[0]
+    found = body_sightings(scene.recording.frames[:8], [tag], odometry=scene.recording.odometry, noise=NOISE)
+    assert len(found.sightings) == 8
+    assert len(locate_body(found, tag, arm=ARM).belief.weights) == 1

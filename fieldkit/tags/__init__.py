@@ -5,9 +5,10 @@ from fieldkit.tags.detectors import DETECTORS, FoundTag, TagDetector
 from fieldkit.tags.drawing import draw_tag
 from fieldkit.tags.families import FAMILIES, check_families
 from fieldkit.tags.fusion import Sighting, TagFix, fuse_sightings
+from fieldkit.tags.joint import image_covariance
 from fieldkit.tags.pose import TagSolution, solve, tag_corners
 from fieldkit.tags.sightings import BodySighting, BodySightings, Place, body_sightings, frames_between, placed_tags
-from fieldkit.tags.standing import BodyFix, body_in_map, hand_covariance, image_covariance, locate_body
+from fieldkit.tags.standing import BodyFix, body_in_map, hand_covariance, locate_body
 
 __all__ = [
     "DETECTORS",
