@@ -41,6 +41,7 @@ GRID = {
     "arm": (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
     "jitter_s": (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016),
     "blur_s": (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016),
+    "corner_px": (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2),
 }
 ARM_PER_IMAGE = image_covariance(ArmNoise())
 _TAG_STEP = 1e-5
@@ -48,16 +49,19 @@ _TAG_STEP = 1e-5
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """What residuals may be made of beside the corners' own noise; a still arm shows only the first.
+    """What residuals may be made of beside the corners' own noise; a still arm does not show
+    jitter and blur.
 
     ``arm`` is the factor of the arm's stated standard deviations in one image (`ArmNoise`). ``jitter_s``: an image is
     taken at another time than stated, or between samples of an arm that does not move evenly. ``blur_s``: corners of a
-    moving image err by so many seconds of its motion, each by itself.
+    moving image err by so many seconds of its motion, each by itself. ``corner_px``: corners err by more than their
+    detector states, each by itself: another lens than the model, paper that is not flat.
     """
 
     arm: float = 1.0
     jitter_s: float = GRID["jitter_s"][-1]
     blur_s: float = GRID["blur_s"][-1]
+    corner_px: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +121,7 @@ class Problem:
 
     sweep: Sweep
     observed: Array
-    sigma: Array
+    noise: Array
     points: Array
     parameters: tuple[Parameter, ...]
     free: NDArray[np.int64]
@@ -129,7 +133,8 @@ class Problem:
     motion: Motion
 
     @staticmethod
-    def of(sweep: Sweep, fixed: frozenset[int]) -> Problem:
+    def of(sweep: Sweep, fixed: frozenset[int], *, size_sigma: float = SIZE_SHARE) -> Problem:
+        """State the problem without ``fixed`` parameters; ``size_sigma``: what the tags' sizes are known to."""
         camera = refinable(sweep.camera)
         parameters = (*hand_parameters(), latency_parameter(), *camera_parameters(camera))
         joints = _joint_axes(sweep)
@@ -139,17 +144,22 @@ class Problem:
         return Problem(
             dataclasses.replace(sweep, camera=camera),
             sweep.corners_px,
-            sweep.sigma_px,
+            sweep.noise_px,
             np.stack([tag_corners(sizes[g]) for g in sweep.stand]),
             parameters,
             np.array(free),
             joints,
-            np.array([p.wide for p in parameters] + [JOINT_SIGMA_RAD] * len(joints) + [SHRINK_S, EDGE_PX, SIZE_SHARE]),
+            np.array([p.wide for p in parameters] + [JOINT_SIGMA_RAD] * len(joints) + [SHRINK_S, EDGE_PX, size_sigma]),
             np.array([p.step for p in parameters] + [1e-5] * len(joints) + [1e-4, 1e-2, 1e-5]),
             inwards(sweep.corners_px, None),
             np.zeros((len(sweep), 4, 2)),
             Motion.at(sweep, 0.0),
         )
+
+    def around(self, state: State) -> Problem:
+        """Return the problem with the arm's motion taken where the stamps now are, and the corners' with it."""
+        near = dataclasses.replace(self, motion=Motion.at(self.sweep, float(state.values[LATENCY])))
+        return dataclasses.replace(near, shrinking=inwards(near.observed, speed_px(near, state)))
 
     def cameras(self, values: Array) -> Pose:
         """Return ref_from_cam (n)."""
@@ -179,7 +189,7 @@ class Problem:
     def linearise(self, state: State) -> Linear:
         """Return residuals and their derivatives, numerically."""
         cameras, values = self.cameras(state.values), state.values
-        n, columns = len(self.sigma), []
+        n, columns = len(self.noise), []
         for d in _TAG_STEP * np.eye(6):
             ahead = self.predict(cameras, state.tags * _exp(d), values)
             columns.append((ahead - self.predict(cameras, state.tags * _exp(-d), values)) / (2 * _TAG_STEP))
@@ -209,8 +219,8 @@ class Problem:
     def weights(self, linear: Linear, noise: Noise) -> tuple[Array, Array]:
         """Return the inverse covariance (n, 8, 8) of the residuals and its log determinant (n,)."""
         speed = np.mean(linear.by_time**2, axis=1) * 2
-        own = self.sigma**2 + noise.blur_s**2 * speed
-        total = own[:, None, None] * np.eye(8)
+        alone = noise.corner_px**2 + noise.blur_s**2 * speed
+        total = self.noise + alone[:, None, None] * np.eye(8)
         total = total + noise.arm**2 * linear.by_camera @ ARM_PER_IMAGE @ linear.by_camera.transpose(0, 2, 1)
         total += noise.jitter_s**2 * linear.by_time[:, :, None] * linear.by_time[:, None, :]
         return np.asarray(np.linalg.inv(total)), -np.asarray(np.linalg.slogdet(total)[1])

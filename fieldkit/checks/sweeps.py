@@ -43,7 +43,7 @@ class Stand:
 class Sweep:
     """Sightings (n) of tags in stands (g), all by one camera.
 
-    ``t_ns`` stamps, ``stand`` int[n], ``corners_px`` f64[n, 4, 2] and their noise ``sigma_px`` f64[n];
+    ``t_ns`` stamps, ``stand`` int[n], ``corners_px`` f64[n, 4, 2] and their covariance ``noise_px`` f64[n, 8, 8];
     ``ref_from_body`` is how the body swayed since the stand's begin, by odometry. ``left_out`` says what was not
     used, with counts.
     """
@@ -68,9 +68,9 @@ class Sweep:
         return np.stack([d.corners_px for d in self.detections])
 
     @property
-    def sigma_px(self) -> Array:
-        """Noise per axis of the corners f64[n] in pixels."""
-        return np.array([d.sigma_px for d in self.detections])
+    def noise_px(self) -> Array:
+        """Covariance f64[n, 8, 8] of the corners in pixels."""
+        return np.stack([d.noise_px for d in self.detections])
 
 
 def find_sweep(
