@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fieldkit.bags.content import Content, collect
 from fieldkit.bags.layouts import Layout
 from fieldkit.bags.reading import choose_layout, general_warnings, make_frames, open_source, topic_list
+from fieldkit.bags.tagged import tag_frames
 from fieldkit.bags.tf import TfBuffer
-from fieldkit.cameras import Camera
 from fieldkit.errors import BagError, FrameError
 from fieldkit.frames import Pose, Trajectory
 from fieldkit.types import Frame
@@ -49,22 +49,21 @@ class Kinematics:
 
 @dataclasses.dataclass(frozen=True)
 class ArmRecording:
-    """Images of the arm camera, its calibrations, both in the order of stamps, kinematics, and odometry if any."""
+    """Images of the arm camera in the order of stamps, kinematics, and odometry if any.
+
+    ``tag_frames`` are messages of tag detections by the arm camera, frames without an image.
+    """
 
     path: str
     frames: tuple[Frame, ...]
-    cameras: tuple[tuple[int, Camera], ...]
     kinematics: Kinematics
     odometry: Trajectory | None
     warnings: tuple[str, ...]
-
-    def camera_at(self, t_ns: int) -> Camera:
-        """Return the calibration whose stamp is nearest."""
-        return min(self.cameras, key=lambda item: abs(item[0] - t_ns))[1]
+    tag_frames: tuple[Frame, ...] = ()
 
 
 def open_arm(path: Path | str, *, layout: str | Layout | None = None) -> ArmRecording:
-    """Read the images and the kinematics of a recording, whatever waypoints it has; images stay in the bag.
+    """Read the images, tag detections and kinematics of a recording, whatever waypoints it has; images stay in the bag.
 
     Raises BagError where the camera's calibration or the transforms from body to camera are missing.
     """
@@ -87,9 +86,10 @@ def open_arm(path: Path | str, *, layout: str | Layout | None = None) -> ArmReco
         odometry, repeated = content.odometry.trajectory(parent=chosen.odom_frame, child=chosen.body_frame)
     body = chosen.body_frame if odometry is None else odometry.child
     frames, _ = make_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=body)
+    tagged, notes = tag_frames(bag, content, camera_frame=chosen.camera_frame, body_frame=body)
     kinematics = _kinematics(bag.path, content, body=body, camera=_camera_frame(content, chosen))
-    warnings = general_warnings(bag, content, 0 if odometry is None else repeated)
-    return ArmRecording(str(path), frames, tuple(content.cameras), kinematics, odometry, tuple(warnings))
+    warnings = [*general_warnings(bag, content, 0 if odometry is None else repeated), *notes]
+    return ArmRecording(str(path), frames, kinematics, odometry, tuple(warnings), tagged)
 
 
 def _camera_frame(content: Content, layout: Layout) -> str:

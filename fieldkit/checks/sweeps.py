@@ -9,13 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.bags import ArmRecording, Kinematics, read_detections
+from fieldkit.bags import ArmRecording, Kinematics
 from fieldkit.cameras import Camera
 from fieldkit.errors import FrameError, TagError
 from fieldkit.frames import Array, Pose, Trajectory, pose_error
-from fieldkit.tags import TagDetection, detect
-from fieldkit.tags.detect import COARSE_SIGMA_PX
-from fieldkit.types import Frame, Image
+from fieldkit.tags import TagDetection, tags_in, with_noise
+from fieldkit.types import Frame
 
 Progress = Callable[[str, int, int], None]
 
@@ -82,47 +81,29 @@ def find_sweep(
 ) -> Sweep:
     """Find tags of known sizes (key None: all others) in the images of a recording while the body stands.
 
-    Without odometry the body is taken to stand. Raises TagError when no tag is seen MIN_SIGHTINGS times in one stand.
+    Where there is no image, detections that were recorded stand in. Without odometry the body is taken to stand.
+    Raises TagError when no tag is seen MIN_SIGHTINGS times in one stand.
     """
-    looks = _looks(recording)
-    frames, left_out = _standing(recording, [frame for frame, _ in looks])
+    frames, left_out = _standing(recording, recording.frames or [f for f in recording.tag_frames if f.tags])
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_IMAGES)).astype(int))]
-    told = {frame.t_ns: detections for frame, detections in looks}
+    wanted = [(tag_id, f) for tag_id in sorted(sizes_m, key=lambda k: (k is None, k)) for f in families]
     found: list[tuple[Frame, TagDetection]] = []
-    other = 0
+    other, before = 0, set[tuple[int, int, str]]()
     for number, frame in enumerate(chosen):
         if progress is not None:
             progress("find tags", number + 1, len(chosen))
         if frame.camera != chosen[0].camera:
             other += 1
             continue
-        known = told[frame.t_ns]
-        seen = detect(frame.read(), frame.camera, families=families) if known is None else known
-        ids = [d.id for d in seen]
-        found += [(frame, d) for d in seen if ids.count(d.id) == 1 and (d.id in sizes_m or None in sizes_m)]
+        # Two detectors may have searched one image
+        seen = [d for d in tags_in(frame, wanted) if (frame.t_ns, d.id, d.family) not in before]
+        before |= {(frame.t_ns, d.id, d.family) for d in seen}
+        found += [(frame, d) for d in seen]
     if other:
         left_out["with another calibration than the first"] = other
+    known = with_noise([(d, f.camera, sizes_m[d.id if d.id in sizes_m else None]) for f, d in found])
+    found = [(frame, d) for (frame, _), d in zip(found, known, strict=True)]
     return _group(recording, found, sizes_m, len(chosen), left_out)
-
-
-def _looks(recording: ArmRecording) -> list[tuple[Frame, list[TagDetection] | None]]:
-    """Return every image; or, where there is none, every message of somebody else's detector with what it found."""
-    if recording.frames:
-        return [(frame, None) for frame in recording.frames]
-    by_time: dict[int, list[TagDetection]] = {}
-    frames: dict[int, Frame] = {}
-    for tag in read_detections(recording.path).tags:
-        camera = recording.camera_at(tag.t_ns)
-        corners = tag.corners(camera)
-        if corners is not None:
-            frames[tag.t_ns] = Frame(tag.t_ns, camera, None, _no_image)
-            detection = TagDetection(tag.id, tag.family or "tag36h11", corners, COARSE_SIGMA_PX)
-            by_time.setdefault(tag.t_ns, []).append(detection)
-    return [(frame, by_time[t_ns]) for t_ns, frame in sorted(frames.items())]
-
-
-def _no_image() -> Image:
-    raise AssertionError("a recorded detection has no image")
 
 
 def _standing(recording: ArmRecording, frames: Sequence[Frame]) -> tuple[list[Frame], dict[str, int]]:
@@ -163,10 +144,10 @@ def _group(
 ) -> Sweep:
     """Give every sighting its stand; drop stands with too few sightings."""
     begins = _stand_begins(recording.odometry)
-    members: dict[tuple[int, int], list[tuple[Frame, TagDetection]]] = {}
+    members: dict[tuple[int, int, str], list[tuple[Frame, TagDetection]]] = {}
     for frame, detection in found:
         number = int(np.searchsorted(begins, frame.t_ns, side="right"))
-        members.setdefault((number, detection.id), []).append((frame, detection))
+        members.setdefault((number, detection.id, detection.family), []).append((frame, detection))
     kept = {key: rows for key, rows in members.items() if len(rows) >= MIN_SIGHTINGS}
     few = len(found) - sum(len(rows) for rows in kept.values())
     if few:
@@ -176,7 +157,7 @@ def _group(
     rows = [(k, *row) for k, own in enumerate(kept.values()) for row in own]
     stands = tuple(
         Stand(tag_id, sizes_m[tag_id] if tag_id in sizes_m else sizes_m[None], own[0][0].t_ns)
-        for (_, tag_id), own in kept.items()
+        for (_, tag_id, _), own in kept.items()
     )
     swayed = [_swayed(recording.odometry, stands[k].t_begin_ns, f.t_ns) for k, f, _ in rows]
     return Sweep(

@@ -6,7 +6,16 @@ from fieldkit.tags.drawing import draw_tag
 from fieldkit.tags.families import FAMILIES
 from fieldkit.tags.fusion import Sighting, TagFix, fuse_sightings
 from fieldkit.tags.pose import TagSolution, solve, tag_corners
-from fieldkit.tags.sightings import BodySighting, BodySightings, Place, body_sightings, frames_between, placed_tags
+from fieldkit.tags.sightings import (
+    BodySighting,
+    BodySightings,
+    Place,
+    body_sightings,
+    frames_between,
+    placed_tags,
+    tags_in,
+    with_noise,
+)
 from fieldkit.tags.standing import BodyFix, body_in_map, hand_covariance, image_covariance, locate_body
 
 __all__ = [
@@ -34,4 +43,6 @@ __all__ = [
     "placed_tags",
     "solve",
     "tag_corners",
+    "tags_in",
+    "with_noise",
 ]
