@@ -9,7 +9,7 @@ import numpy as np
 
 from fieldkit.cameras import Camera
 from fieldkit.checks.handeye import SweepFit, fit_sweep
-from fieldkit.checks.parameters import changed, refinable
+from fieldkit.checks.parameters import changed, refinable, require_positive
 from fieldkit.checks.sweep_problem import CAMERA, GRID, HAND
 from fieldkit.checks.sweeps import Sweep
 from fieldkit.errors import TagError
@@ -88,8 +88,10 @@ class Refined:
 def check_arm(sweep: Sweep, *, sigmas: float = SIGMAS) -> ArmCheck:
     """Fit a sweep and compare camera, hand_from_cam and stamps with what is stated.
 
-    A deviation counts from ``sigmas`` standard deviations. Raises TagError where the sweep determines nothing.
+    A deviation counts from ``sigmas`` standard deviations. Raises TagError where the sweep determines nothing, or for
+    ``sigmas`` that are no number above 0.
     """
+    require_positive("--sigmas", sigmas)
     fit = fit_sweep(sweep)
     findings = []
     for i, p in enumerate(fit.parameters):

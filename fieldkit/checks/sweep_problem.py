@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fieldkit.checks.parameters import (
     Parameter,
@@ -163,13 +164,43 @@ class Problem:
 
     def cameras(self, values: Array) -> Pose:
         """Return ref_from_cam (n)."""
-        links = self.motion.links(float(values[LATENCY]))
-        zeros = values[len(self.parameters) : -3]
         result = self.sweep.ref_from_body
-        for index, link in enumerate(links):
-            turn = sum((axis * z for (i, axis), z in zip(self.joints, zeros, strict=True) if i == index), np.zeros(3))
-            result = result * link * _exp(np.concatenate([turn, np.zeros(3)]))
+        for link, turn in self._chain(values):
+            result = result * link
+            if turn is not None:
+                result = result * _exp(np.concatenate([turn, np.zeros(3)]))
         return result * _exp(values[HAND])
+
+    def _chain(self, values: Array) -> list[tuple[Pose, Array | None]]:
+        """Return every step's transforms (n), and the small rotation (3,) by which its joint's zero is off, if any."""
+        zeros = values[len(self.parameters) : -3]
+        turns: dict[int, Array] = {}
+        for (i, axis), zero in zip(self.joints, zeros, strict=True):
+            turns[i] = turns.get(i, np.zeros(3)) + zero * axis
+        return [(link, turns.get(i)) for i, link in enumerate(self.motion.links(float(values[LATENCY])))]
+
+    def _turned(self, values: Array) -> list[Array]:
+        """Return by how much (n, 6) the cameras move, in their own frames, with every joint's zero.
+
+        A turn about an axis a through the joint moves a camera at p by a x p. Turns (3,) differ from their derivative
+        by half their product with the axis, and by less than their square.
+        """
+        joint_from_cam, after = _exp(values[HAND]), {}
+        chain = self._chain(values)
+        for i in range(len(chain) - 1, -1, -1):
+            link, turn = chain[i]
+            after[i] = joint_from_cam
+            if turn is not None:
+                joint_from_cam = _exp(np.concatenate([turn, np.zeros(3)])) * joint_from_cam
+            joint_from_cam = link * joint_from_cam
+        moved = []
+        for i, axis in self.joints:
+            turn = chain[i][1]
+            along = axis if turn is None else axis - np.cross(turn, axis) / 2
+            rotation, n = after[i].rotation.inv(), len(self.noise)
+            shift = rotation.apply(np.cross(along, after[i].translation))
+            moved.append(np.hstack([np.broadcast_to(part, (n, 3)) for part in (rotation.apply(along), shift)]))
+        return moved
 
     def predict(self, cameras: Pose, tags: Pose, values: Array) -> Array:
         """Return the corners' pixels (n, 4, 2)."""
@@ -193,27 +224,36 @@ class Problem:
         for d in _TAG_STEP * np.eye(6):
             ahead = self.predict(cameras, state.tags * _exp(d), values)
             columns.append((ahead - self.predict(cameras, state.tags * _exp(-d), values)) / (2 * _TAG_STEP))
-        for k in self.free:
-            columns.append(self.slope(state, cameras, int(k)))
         by_camera = []
         for d in _TAG_STEP * np.eye(6):
             ahead = self.predict(cameras * _exp(d), state.tags, values)
             by_camera.append((ahead - self.predict(cameras * _exp(-d), state.tags, values)) / (2 * _TAG_STEP))
+        by_cameras = np.stack([c.reshape(n, 8) for c in by_camera], axis=2)
+        turned, first = self._turned(values), len(self.parameters)
+        for k in self.free:
+            if 0 <= k - first < len(turned):
+                columns.append(np.einsum("nai,ni->na", by_cameras, turned[k - first]))
+            else:
+                columns.append(self.slope(state, cameras, int(k)))
         return Linear(
             (self.observed - self.predict(cameras, state.tags, values)).reshape(n, 8),
             np.stack([c.reshape(n, 8) for c in columns], axis=2),
-            np.stack([c.reshape(n, 8) for c in by_camera], axis=2),
+            by_cameras,
             self.slope(state, cameras, LATENCY).reshape(n, 8),
         )
 
     def slope(self, state: State, cameras: Pose, k: int) -> Array:
-        """Return the derivative (n, 4, 2) of the predicted pixels by a number."""
+        """Return the derivative (n, 4, 2) of the predicted pixels by a number, not by a joint's zero."""
         step = np.zeros(len(self.prior))
         step[k] = self.steps[k]
         ahead, behind = state.values + step, state.values - step
-        moves = k <= LATENCY or len(self.parameters) <= k < len(self.prior) - 3
-        high = self.predict(self.cameras(ahead) if moves else cameras, state.tags, ahead)
-        low = self.predict(self.cameras(behind) if moves else cameras, state.tags, behind)
+        at = [cameras, cameras]
+        if k == LATENCY:
+            at = [self.cameras(ahead), self.cameras(behind)]
+        elif k < LATENCY:
+            ref_from_hand = cameras * _exp(state.values[HAND]).inv()
+            at = [ref_from_hand * _exp(v[HAND]) for v in (ahead, behind)]
+        high, low = (self.predict(c, state.tags, v) for c, v in zip(at, (ahead, behind), strict=True))
         return (high - low) / (2 * float(self.steps[k]))
 
     def weights(self, linear: Linear, noise: Noise) -> tuple[Array, Array]:
@@ -262,8 +302,7 @@ class Problem:
 
 def _exp(d: Array) -> Pose:
     """Return Exp of (6,) or (n, 6), as `fieldkit.frames.exp` does for one."""
-    turn = Pose.from_rotation(type(Pose.identity().rotation).from_rotvec(d[..., :3]))
-    return Pose.from_translation(d[..., 3:]) * turn
+    return Pose.from_components(d[..., 3:], Rotation.from_rotvec(d[..., :3]))
 
 
 def _joint_axes(sweep: Sweep) -> tuple[tuple[int, Array], ...]:
