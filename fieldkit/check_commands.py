@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -181,12 +182,7 @@ def _arm_json(found: ArmCheck) -> dict[str, Any]:
         "n_used": int(fit.used.sum()),
         "n_stands": len(found.sweep.stands),
         "rms_px": {"stated": fit.rms_px[0], "found": fit.rms_px[1]},
-        "noise": {
-            "arm": fit.noise.arm,
-            "jitter_s": fit.noise.jitter_s,
-            "blur_s": fit.noise.blur_s,
-            "corner_px": fit.noise.corner_px,
-        },
+        "noise": dataclasses.asdict(fit.noise),
         "contradiction": found.contradiction,
         "frames": {"body": kinematics.body_frame, "camera": kinematics.camera_frame},
         "left_out": dict(found.sweep.left_out),

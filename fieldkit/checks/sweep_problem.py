@@ -251,8 +251,8 @@ class Problem:
         if k == LATENCY:
             at = [self.cameras(ahead), self.cameras(behind)]
         elif k < LATENCY:
-            ref_from_hand = cameras * _exp(state.values[HAND]).inv()
-            at = [ref_from_hand * _exp(v[HAND]) for v in (ahead, behind)]
+            cam_from_hand = _exp(state.values[HAND]).inv()
+            at = [cameras * (cam_from_hand * _exp(v[HAND])) for v in (ahead, behind)]
         high, low = (self.predict(c, state.tags, v) for c, v in zip(at, (ahead, behind), strict=True))
         return (high - low) / (2 * float(self.steps[k]))
 
