@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,8 +58,11 @@ def tags_check(
         force: replace existing files
     """
     from fieldkit import store
+    from fieldkit.checks import require_positive
     from fieldkit.tags import check_families
 
+    require_positive("--sigmas", sigmas)
+    require_positive("--tape-sigma-m", tape_sigma_m)
     outputs = [path for path in (refine_camera, refine_hand) if path is not None]
     for path in outputs:
         store.refuse_existing(path, force=force, kind="file")
@@ -157,6 +161,8 @@ def _total_latency(given: Corrections, refined: Refined) -> tuple[float, float] 
 
 
 def _print_arm(found: ArmCheck) -> None:
+    from fieldkit.checks import CONTRADICTION_HINT
+
     fit, sweep = found.fit, found.sweep
     title = (
         f"{sweep.path}: {int(fit.used.sum())} of {len(sweep)} sightings in {len(sweep.stands)} stands; residuals "
@@ -176,6 +182,9 @@ def _print_arm(found: ArmCheck) -> None:
     words = (
         f"arm {noise.arm:g} times 0.2 deg and 2 mm, time {1e3 * noise.jitter_s:g} ms, blur {1e3 * noise.blur_s:g} ms"
     )
+    words += f", corners {noise.corner_px:g} px more than stated" if noise.corner_px else ""
+    if found.contradiction is not None:
+        console.print(f"{found.contradiction}; {CONTRADICTION_HINT}", markup=False)
     console.print(f"noise shown: {words}; verdict: {found.verdict}", markup=False)
 
 
@@ -201,7 +210,8 @@ def _arm_json(found: ArmCheck) -> dict[str, Any]:
         "n_used": int(fit.used.sum()),
         "n_stands": len(found.sweep.stands),
         "rms_px": {"stated": fit.rms_px[0], "found": fit.rms_px[1]},
-        "noise": {"arm": fit.noise.arm, "jitter_s": fit.noise.jitter_s, "blur_s": fit.noise.blur_s},
+        "noise": dataclasses.asdict(fit.noise),
+        "contradiction": found.contradiction,
         "frames": {"body": kinematics.body_frame, "camera": kinematics.camera_frame},
         "left_out": dict(found.sweep.left_out),
         "findings": rows,

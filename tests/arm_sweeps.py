@@ -5,27 +5,28 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+from empty_floor import empty_floor
 
 from fieldkit.bags import RecordingWriter
 from fieldkit.cameras import Camera
 from fieldkit.frames import Array, Pose, exp, log
-from fieldkit.tags import detect
+from fieldkit.tags import TagDetection, detect
 from sim_bridge import robot
+from sim_bridge.aim import facing
 from sim_bridge.recording import recorder
 from sim_bridge.recording.recorder import Sensed
 from sim_bridge.recording.schedule import Schedule, Shot, lagging
-from sim_bridge.scenes import make_scene
 from sim_bridge.sensors import STANDARD, Sensors
 from sim_bridge.stage import staging
 from sim_bridge.stage.paths import Track, TrackBuilder
 
 SIZE_M = 0.1365
 KINEMATICS = robot.KinematicOptions()
-STAGE = staging.StageOptions(waypoints=0, start_places=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,13 +46,25 @@ class Stated:
     focal: float = 0.0
 
 
+@dataclasses.dataclass(frozen=True)
+class Told:
+    """What stands in a recording in place of images: detections on topics, of a camera's frame (None: the arm's)."""
+
+    topics: tuple[str, ...] = ("/detections",)
+    frame: str | None = None
+    hamming: int = 0
+
+
 AS_IT_IS = Stated()
 
 
 @functools.cache
 def before_tag() -> staging.Stage:
-    """A robot that stands before the start tag of a room."""
-    return staging.set_stage(make_scene("room", 0), STAGE, rng=np.random.default_rng(0))
+    """A robot that stands before a tag on a bare wall: nothing else matters here, and it is drawn quickly."""
+    tag = staging.PlacedTag(1, SIZE_M, facing((3.47, 2.9, 0.59), np.pi + 0.21))
+    wall = tag.world_from_tag * Pose.from_translation([0.0, 0.0, -0.06])
+    scene = empty_floor((6.0, 6.0), ()).with_box(wall, (4.0, 3.0, 0.1), rgb=(150, 145, 140))
+    return staging.Stage(staging.with_tag(scene, tag), tag, robot.standing((2.0, 3.0), 0.0), ())
 
 
 def sweep(
@@ -110,10 +123,12 @@ def _arms(
     return found
 
 
-def write(path: Path, swept: Swept, stated: Stated = AS_IT_IS, *, layout: str = "generic", images: bool = True) -> Path:
+def write(
+    path: Path, swept: Swept, stated: Stated = AS_IT_IS, *, layout: str = "generic", told: Told | None = None
+) -> Path:
     """Write an MCAP recording with the errors of ``stated`` in its tf, stamps and CameraInfo.
 
-    Without ``images`` it holds apriltag_ros' detections in their place.
+    With ``told`` it holds apriltag_ros' detections in place of images.
     """
     sensed = swept.sensed
     fx, fy, *rest = sensed.camera.params
@@ -130,26 +145,35 @@ def write(path: Path, swept: Swept, stated: Stated = AS_IT_IS, *, layout: str = 
         for image in sensed.images:
             t_ns = image.t_ns + stated.late_ns
             writer.camera_info(t_ns, said)
-            if images:
+            if told is None:
                 writer.image(t_ns, image.jpeg)
             else:
-                _write_detections(writer, t_ns, image.jpeg, sensed.camera)
+                _write_detections(writer, t_ns, _detected(image.jpeg, sensed.camera), told)
     return path
 
 
-def _write_detections(writer: RecordingWriter, t_ns: int, jpeg: bytes, camera: Camera) -> None:
+def _write_detections(writer: RecordingWriter, t_ns: int, seen: Sequence[TagDetection], told: Told) -> None:
     assert writer._open is not None
     store = writer._open.container.store
     point = store.types["apriltag_msgs/msg/Point"]
     kind = store.types["apriltag_msgs/msg/AprilTagDetection"]
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     found = [
-        kind(d.family, d.id, 0, 0.0, 60.0, point(0.0, 0.0), [point(*c) for c in d.corners_px.tolist()], np.zeros(9))
-        for d in detect(np.asarray(image, dtype=np.uint8), camera)
-    ]
-    header = writer._header(t_ns, writer.layout.camera_frame)
+        kind(
+            d.family, d.id, told.hamming, 0.0, 60.0, point(0.0, 0.0),
+            [point(*c) for c in d.corners_px.tolist()], np.zeros(9),
+        )
+        for d in seen
+    ]  # fmt: skip
+    header = writer._header(t_ns, told.frame or writer.layout.camera_frame)
     message = store.types["apriltag_msgs/msg/AprilTagDetectionArray"](header, found)
-    writer._write("/detections", message, t_ns)
+    for topic in told.topics:
+        writer._write(topic, message, t_ns)
+
+
+@functools.cache
+def _detected(jpeg: bytes, camera: Camera) -> tuple[TagDetection, ...]:
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return tuple(detect(np.asarray(image, dtype=np.uint8), camera))
 
 
 def said_mount(stated: Stated) -> Pose:

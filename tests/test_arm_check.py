@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arm_sweeps import SIZE_M, Stated, Swept, said_mount, sweep, true_correction, write
+from arm_sweeps import SIZE_M, Stated, Swept, Told, said_mount, sweep, true_correction, write
 from bag_samples import Options, write_sample
 
 from fieldkit.bags import open_arm
-from fieldkit.checks import ArmCheck, check_arm, find_sweep, refine_arm
+from fieldkit.checks import ArmCheck, Finding, Sweep, check_arm, find_sweep, refine_arm
 from fieldkit.cli import main
 from fieldkit.errors import BagError, TagError
-from fieldkit.frames import pose_error
+from fieldkit.frames import Pose, pose_error
 from fieldkit.store import read_camera, read_hand, write_tags
 from fieldkit.types import TagMap
 from sim_bridge import robot
@@ -27,7 +27,7 @@ SIZES = {None: SIZE_M}
 
 @pytest.fixture(scope="module")
 def swept() -> Swept:
-    return sweep(3, poses=13)
+    return sweep(3, poses=11)
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +38,28 @@ def recording(tmp_path_factory: pytest.TempPathFactory, swept: Swept) -> Path:
 @pytest.fixture(scope="module")
 def wrong(recording: Path) -> ArmCheck:
     return check_arm(find_sweep(open_arm(recording), SIZES))
+
+
+@pytest.fixture(scope="module")
+def messages(tmp_path_factory: pytest.TempPathFactory, swept: Swept) -> Path:
+    return write(tmp_path_factory.mktemp("told") / "tags.mcap", swept, WRONG, told=Told())
+
+
+@pytest.fixture(scope="module")
+def ordinary() -> Sweep:
+    """An ordinary session, every third image of it."""
+    session = open_arm(Path(__file__).parent.parent / "data_samples" / "room" / "session")
+    return find_sweep(dataclasses.replace(session, frames=session.frames[::3]), SIZES)
+
+
+def stated_larger(sweep: Sweep, factor: float) -> Sweep:
+    """The same sightings, the tags stated larger than they are."""
+    stands = tuple(dataclasses.replace(s, size_m=factor * s.size_m) for s in sweep.stands)
+    return dataclasses.replace(sweep, stands=stands)
+
+
+def size_of(check: ArmCheck) -> Finding:
+    return next(f for f in check.findings if f.name == "size of the tags")
 
 
 def verdicts(check: ArmCheck) -> dict[str, str]:
@@ -71,18 +93,57 @@ def test_what_is_stated_wrongly_fails_and_what_is_stated_rightly_passes(wrong: A
 
 
 def test_a_recording_that_states_the_truth_passes(tmp_path: Path, swept: Swept) -> None:
-    path = write(tmp_path / "right.mcap", swept)
+    path = write(tmp_path / "right.mcap", swept, told=Told())
     found = verdicts(check_arm(find_sweep(open_arm(path), SIZES)))
     assert "fail" not in found.values()
     assert list(found.values()).count("pass") >= 14
 
 
-def test_a_wrong_size_of_the_tags_is_found_in_an_ordinary_session() -> None:
-    session = open_arm(Path(__file__).parent.parent / "data_samples" / "room" / "session")
-    larger = check_arm(find_sweep(session, {None: 1.05 * SIZE_M}))
-    size = next(f for f in larger.findings if f.name == "size of the tags")
+@pytest.mark.parametrize("factor", [1.05, 1.1, 1.25])
+def test_a_wrong_size_of_the_tags_is_found_in_an_ordinary_session_and_nothing_else_is_blamed(
+    ordinary: Sweep, factor: float
+) -> None:
+    check = check_arm(stated_larger(ordinary, factor))
+    size = size_of(check)
+    assert size.sigma < 0.3
+    assert size.deviation == pytest.approx(100 * (1 / factor - 1), abs=3 * size.sigma)
+    assert [f.name for f in check.findings if f.verdict == "fail"] == ["size of the tags"]
+    assert check.fit.rms_px[1] < 0.4
+    assert check.contradiction is None
+
+
+@pytest.mark.parametrize("factor", [1.5, 1 / 1.5])
+def test_a_size_that_is_wrong_by_half_does_not_hide_a_wrong_hand(swept: Swept, wrong: ArmCheck, factor: float) -> None:
+    check = check_arm(stated_larger(wrong.sweep, factor))
+    size = size_of(check)
     assert size.verdict == "fail"
-    assert size.deviation == pytest.approx(-5.0, abs=3 * size.sigma)
+    assert size.sigma < 0.5
+    assert size.deviation == pytest.approx(100 * (1 / factor - 1), abs=3 * size.sigma)
+    deviation = (check.fit.values - expected(swept, WRONG)) / np.sqrt(np.diag(check.fit.covariance))
+    assert np.abs(deviation).max() < 3.5
+
+
+def test_a_recording_that_no_arm_explains_contradicts_itself(wrong: ArmCheck, rng: np.random.Generator) -> None:
+    sways = Pose.from_translation(rng.normal(0.0, 0.03, (len(wrong.sweep), 3)))
+    check = check_arm(dataclasses.replace(wrong.sweep, ref_from_body=sways))
+    assert check.contradiction is not None
+    assert check.contradiction.startswith(
+        "the recording contradicts itself beyond any arm's noise: the arm needs 5 times"
+    )
+    assert check.verdict == "fail"
+    with pytest.raises(TagError, match=r"contradicts itself .* to refine the hand; check size_m of the tags, tf and"):
+        refine_arm(check, what="hand")
+    assert wrong.contradiction is None
+
+
+def test_corners_that_are_noisier_than_their_detector_says_do_not_blame_the_camera(
+    ordinary: Sweep, rng: np.random.Generator
+) -> None:
+    noisy = [dataclasses.replace(d, corners_px=d.corners_px + rng.normal(0, 0.3, (4, 2))) for d in ordinary.detections]
+    check = check_arm(dataclasses.replace(ordinary, detections=tuple(noisy)))
+    assert check.verdict in ("pass", "warn")
+    assert 0.2 <= check.fit.noise.corner_px <= 0.4
+    assert check.fit.used.mean() > 0.9
 
 
 def test_camera_and_hand_are_refined_to_what_they_are(swept: Swept, wrong: ArmCheck) -> None:
@@ -96,19 +157,36 @@ def test_camera_and_hand_are_refined_to_what_they_are(swept: Swept, wrong: ArmCh
     assert np.linalg.eigvalsh(refined.covariance).min() > 0
 
 
-def test_a_driver_that_gives_the_wrist_alone_is_checked_too(tmp_path: Path, swept: Swept) -> None:
-    path = write(tmp_path / "spot.mcap", swept, WRONG, layout="spot_ros1")
-    check = check_arm(find_sweep(open_arm(path), SIZES))
+def test_a_driver_that_gives_the_wrist_alone_is_checked_too(tmp_path: Path, swept: Swept, wrong: ArmCheck) -> None:
+    path = write(tmp_path / "spot.mcap", swept, WRONG, layout="spot_ros1", told=Told())
+    found = find_sweep(open_arm(path), SIZES)
+    # The same images, so the same corners as in the other recording
+    check = check_arm(dataclasses.replace(found, detections=wrong.sweep.detections))
     deviation = (check.fit.values - expected(swept, WRONG)) / np.sqrt(np.diag(check.fit.covariance))
     assert np.abs(deviation[[0, 1, 2, 6, 7]]).max() < 4.0
     assert verdicts(check)["stamps late by"] == "fail"
 
 
-def test_recorded_detections_take_the_place_of_images(tmp_path: Path, swept: Swept) -> None:
-    path = write(tmp_path / "tags.mcap", swept, WRONG, images=False)
-    found = find_sweep(open_arm(path), SIZES)
-    assert len(found) > 20
+def test_recorded_detections_take_the_place_of_images_with_the_noise_that_they_show(
+    messages: Path, wrong: ArmCheck
+) -> None:
+    found = find_sweep(open_arm(messages), SIZES)
+    assert len(found) == len(wrong.sweep)
+    assert found.detections[0].sigma_px < 0.3
     assert verdicts(check_arm(found))["stamps late by"] == "fail"
+
+
+@pytest.mark.parametrize("told", [Told(frame="head_camera"), Told(hamming=2)])
+def test_detections_of_another_camera_and_doubtful_ones_do_not_count(tmp_path: Path, swept: Swept, told: Told) -> None:
+    recording = open_arm(write(tmp_path / "tags.mcap", swept, told=told))
+    assert any("of frame 'head_camera', not of the arm camera" in w for w in recording.warnings) == bool(told.frame)
+    with pytest.raises(TagError, match=r"tags\.mcap: no image and no detected tag in it; expected images of tags"):
+        find_sweep(recording, SIZES)
+
+
+def test_what_two_detectors_find_in_one_image_counts_once(tmp_path: Path, swept: Swept, messages: Path) -> None:
+    twice = find_sweep(open_arm(write(tmp_path / "twice.mcap", swept, told=Told(("/a", "/b")))), SIZES)
+    assert len(twice) == len(find_sweep(open_arm(messages), SIZES))
 
 
 def test_an_arm_that_stands_at_every_image_shows_no_latency(tmp_path: Path) -> None:
@@ -129,16 +207,17 @@ def test_a_hand_that_turns_about_one_axis_cannot_be_refined(tmp_path: Path) -> N
 
 
 def test_the_command_says_what_is_wrong_and_writes_what_it_found(
-    tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, messages: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_tags(tmp_path / "tags.toml", TagMap((), (), "map"))
-    words = ["tags", "check", tmp_path / "tags.toml", "--recording", recording, "--size-m", SIZE_M, "--json"]
+    words = ["tags", "check", tmp_path / "tags.toml", "--recording", messages, "--size-m", SIZE_M, "--json"]
     out = ["--refine-camera", tmp_path / "camera.toml", "--refine-hand", tmp_path / "hand.toml"]
     with pytest.raises(SystemExit) as stop:
         main([str(w) for w in (*words, *out)])
     said = json.loads(capsys.readouterr().out)["arm"]
     assert stop.value.code == 3
     assert said["verdict"] == "fail"
+    assert said["contradiction"] is None
     assert {f["name"]: f["verdict"] for f in said["findings"]}["focal length"] == "fail"
     assert read_camera(tmp_path / "camera.toml").focal_px == pytest.approx(robot.ARM_CAMERA.focal_px, rel=0.01)
     hand = read_hand(tmp_path / "hand.toml")
@@ -171,12 +250,24 @@ def test_an_arm_that_showed_no_latency_leaves_none_in_the_file(wrong: ArmCheck) 
     assert refine_arm(vague, what="hand").latency is None
 
 
-def test_a_recording_without_tags_kinematics_or_sizes_is_named(tmp_path: Path, recording: Path) -> None:
+@pytest.mark.parametrize("option", ["--sigmas", "--tape-sigma-m"])
+@pytest.mark.parametrize("value", ["nan", "inf", "0", "-1"])
+def test_a_sigma_that_is_no_positive_number_is_refused(
+    tmp_path: Path, messages: Path, capsys: pytest.CaptureFixture[str], option: str, value: str
+) -> None:
+    write_tags(tmp_path / "tags.toml", TagMap((), (), "map"))
+    with pytest.raises(SystemExit) as stop:
+        main(["tags", "check", str(tmp_path / "tags.toml"), "--recording", str(messages), option, value])
+    assert stop.value.code == 1
+    assert capsys.readouterr().err == f"fieldkit: {option} {value}; expected a finite number above 0\n"
+
+
+def test_a_recording_without_tags_kinematics_or_sizes_is_named(tmp_path: Path, messages: Path) -> None:
     bare = open_arm(write_sample(tmp_path, "mcap"))
     with pytest.raises(TagError, match=r"robot\.mcap: 0 sightings of tags in .* expected one tag at least 3 times"):
         find_sweep(bare, SIZES)
     with pytest.raises(TagError, match=r"0 sightings of tags in .*sizes are known of tag 77\); sweep the arm"):
-        find_sweep(open_arm(recording), {77: 0.1})
+        find_sweep(open_arm(messages), {77: 0.1})
     (tmp_path / "b").mkdir()
     path = write_sample(tmp_path / "b", "mcap", Options(without=frozenset({"tf"})))
     with pytest.raises(

@@ -1,6 +1,6 @@
 """Checks with what a lab has: a tape measure between tags, and an arm that sweeps its camera over them."""
 
-from fieldkit.checks.arm import ArmCheck, Finding, Refined, check_arm, refine_arm
+from fieldkit.checks.arm import CONTRADICTION_HINT, ArmCheck, Finding, Refined, check_arm, refine_arm
 from fieldkit.checks.distances import (
     TAPE_SIGMA_M,
     DistanceCheck,
@@ -10,9 +10,11 @@ from fieldkit.checks.distances import (
     check_distances,
     parse_tag,
 )
+from fieldkit.checks.parameters import require_positive
 from fieldkit.checks.sweeps import Sweep, find_sweep
 
 __all__ = [
+    "CONTRADICTION_HINT",
     "TAPE_SIGMA_M",
     "ArmCheck",
     "DistanceCheck",
@@ -27,4 +29,5 @@ __all__ = [
     "find_sweep",
     "parse_tag",
     "refine_arm",
+    "require_positive",
 ]

@@ -9,16 +9,21 @@ import numpy as np
 
 from fieldkit.cameras import Camera
 from fieldkit.checks.handeye import SweepFit, fit_sweep
-from fieldkit.checks.parameters import changed, refinable
-from fieldkit.checks.sweep_problem import CAMERA, HAND, LATENCY
+from fieldkit.checks.parameters import changed, refinable, require_positive
+from fieldkit.checks.sweep_problem import CAMERA, GRID, HAND, LATENCY
 from fieldkit.checks.sweeps import Sweep
 from fieldkit.errors import TagError
 from fieldkit.frames import Array, Pose, exp
 
+Verdict = Literal["pass", "warn", "fail", "unknown"]
 SIGMAS = 3.0
 # An error of the tags' size that matters
 SIZE_PERCENT = 1.0
 FOCAL, CENTRE = 7, (9, 10)
+# What remains exceeds the noise that was found by more than unmodelled corners of a sound recording do; and so large a
+# share of its sightings fits the others
+EXCESS, LEAST_USED = 3.0, 0.5
+CONTRADICTION_HINT = "check size_m of the tags, tf and the camera, and that no tag moved"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +40,7 @@ class Finding:
     deviation: float
     sigma: float
     tolerance: float
-    verdict: Literal["pass", "warn", "fail", "unknown"]
+    verdict: Verdict
 
     @property
     def sigmas(self) -> float:
@@ -52,8 +57,15 @@ class ArmCheck:
     findings: tuple[Finding, ...]
 
     @property
-    def verdict(self) -> Literal["pass", "warn", "fail", "unknown"]:
+    def contradiction(self) -> str | None:
+        """What is wrong with the recording as a whole, where no arm and no values of all this explain it."""
+        return _contradiction(self.fit)
+
+    @property
+    def verdict(self) -> Verdict:
         """The worst verdict among what the sweep shows; unknown where it shows nothing."""
+        if self.contradiction is not None:
+            return "fail"
         verdicts = {f.verdict for f in self.findings}
         return next((v for v in ("fail", "warn", "pass") if v in verdicts), "unknown")
 
@@ -78,27 +90,51 @@ class Refined:
 def check_arm(sweep: Sweep, *, sigmas: float = SIGMAS) -> ArmCheck:
     """Fit a sweep and compare camera, hand_from_cam and stamps with what is stated.
 
-    A deviation counts from ``sigmas`` standard deviations. Raises TagError where the sweep determines nothing.
+    A deviation counts from ``sigmas`` standard deviations. Raises TagError where the sweep determines nothing, or for
+    ``sigmas`` that are no number above 0.
     """
+    require_positive("--sigmas", sigmas)
     fit = fit_sweep(sweep)
     findings = []
     for i, p in enumerate(fit.parameters):
-        deviation, sigma = float(fit.values[i]), fit.sigma(i)
-        verdict: Literal["pass", "warn", "fail", "unknown"] = "pass"
-        if sigma > p.tolerance:
-            verdict = "unknown"
-        elif abs(deviation) > sigmas * sigma:
-            verdict = "fail" if abs(deviation) > p.tolerance else "warn"
-        f = p.factor
+        deviation, sigma, f = float(fit.values[i]), fit.sigma(i), p.factor
+        verdict = "unknown" if sigma > p.tolerance else _verdict(deviation, sigma, p.tolerance, sigmas)
         findings.append(Finding(p.name, p.group, p.unit, f * deviation, f * sigma, f * p.tolerance, verdict))
     size, sigma = (100 * v for v in fit.size)
-    told: Literal["pass", "warn", "fail", "unknown"] = "pass"
-    if sigma > SIZE_PERCENT:
-        told = "unknown"
-    elif abs(size) > sigmas * sigma:
-        told = "fail" if abs(size) > SIZE_PERCENT else "warn"
+    told = _verdict(size, sigma, SIZE_PERCENT, sigmas)
+    # A size that the fit could not take as stated is never passed over
+    told = "unknown" if told != "fail" and sigma > SIZE_PERCENT else told
     findings.append(Finding("size of the tags", "tags", "%", size, sigma, SIZE_PERCENT, told))
     return ArmCheck(sweep, fit, tuple(findings))
+
+
+def _verdict(deviation: float, sigma: float, tolerance: float, sigmas: float) -> Verdict:
+    if abs(deviation) <= sigmas * sigma:
+        return "pass"
+    return "fail" if abs(deviation) > tolerance else "warn"
+
+
+def _contradiction(fit: SweepFit) -> str | None:
+    """Say where a fit ends beyond what arm, stamps and blur may be; None where it does not."""
+    noise, ends = fit.noise, []
+    if noise.arm >= GRID["arm"][-1]:
+        ends.append(f"the arm needs {noise.arm:g} times its noise or more")
+    if noise.jitter_s >= GRID["jitter_s"][-1]:
+        ends.append(f"stamps jitter by {1e3 * noise.jitter_s:g} ms or more")
+    if noise.blur_s >= GRID["blur_s"][-1]:
+        ends.append(f"corners err by {1e3 * noise.blur_s:g} ms of their motion or more")
+    if noise.corner_px >= GRID["corner_px"][-1]:
+        ends.append(f"corners err by {noise.corner_px:g} px or more")
+    if fit.excess > EXCESS:
+        ends.append(f"what remains is {fit.excess:.1f} times all noise")
+    if fit.used.mean() < LEAST_USED:
+        ends.append(f"{int((~fit.used).sum())} of {len(fit.used)} sightings fit no others")
+    if not ends:
+        return None
+    return (
+        f"the recording contradicts itself beyond any arm's noise: {', '.join(ends)}; expected every tag at one place "
+        "in all images of a stand"
+    )
 
 
 def refine_arm(check: ArmCheck, *, what: Literal["camera", "hand"]) -> Refined:
@@ -107,6 +143,8 @@ def refine_arm(check: ArmCheck, *, what: Literal["camera", "hand"]) -> Refined:
     What of the camera the sweep does not show keeps its stated value, and the rest is fitted again. Raises TagError
     where it does not show what is to be refined: of the camera focal length and centre, of the hand all six numbers.
     """
+    if check.contradiction is not None:
+        raise TagError(f"{check.sweep.path}: {check.contradiction}, to refine the {what}", hint=CONTRADICTION_HINT)
     kept, covariance = _what_shows(check.fit)
     needed = range(*HAND.indices(len(covariance))) if what == "hand" else (FOCAL, *CENTRE)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from fieldkit.checks.parameters import require_positive
 from fieldkit.errors import TagError
 from fieldkit.frames import Array
 from fieldkit.types import TagMap, TagPose
@@ -102,8 +103,7 @@ def check_distances(
     """
     if not tapes:
         raise TagError("no distance to check; expected at least one")
-    if not (math.isfinite(tape_sigma_m) and tape_sigma_m > 0):
-        raise TagError(f"--tape-sigma-m {tape_sigma_m:g}; expected the tape's standard deviation in m, above 0")
+    require_positive("--tape-sigma-m", tape_sigma_m)
     ends = [(_find(tags, t.a), _find(tags, t.b)) for t in tapes]
     for tape, (a, b) in zip(tapes, ends, strict=True):
         _check_tape(tags, tape, a, b)

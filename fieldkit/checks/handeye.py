@@ -12,16 +12,14 @@ from fieldkit.checks.sweep_problem import (
     CHORD_INTERVALS,
     GRID,
     LATENCY,
+    SIZE_SHARE,
     Linear,
     Mask,
-    Motion,
     Noise,
     Problem,
     State,
     chi_square,
     interval_s,
-    inwards,
-    speed_px,
 )
 from fieldkit.checks.sweeps import Sweep
 from fieldkit.errors import TagError
@@ -34,6 +32,9 @@ SETTLED_S = 1e-4
 MEDIAN_CHI2 = 7.34
 # To begin with: how far stated kinematics and calibration may be off
 START_COVARIANCE: Array = np.diag([math.radians(3.0) ** 2] * 3 + [0.03**2] * 3)
+# What is known beforehand of the logarithm of the tags' size where their stated one does not count; and from how many
+# sigmas apart the stated one does not
+SIZE_UNKNOWN, SIZE_AGREES = 1.0, 3.0
 # Squared deviation of one sighting (8 degrees of freedom) beyond which it is an outlier
 GATE = 40.0
 
@@ -45,7 +46,8 @@ class SweepFit:
     ``values`` f64[p] and ``covariance`` f64[p, p] in rad, m, s, log and pixels. ``noise`` is what the residuals show.
     ``size`` is by how much larger the tags are than stated, as a share, by the sweep alone, and its sigma.
     ``rms_px`` is the root mean square of the corners' residuals before anything is corrected and after, kinematics as
-    they are.
+    they are. ``excess`` is that of what remains over its noise, arm and motion included: about 1 where the noise that
+    was found explains it.
     """
 
     parameters: tuple[Parameter, ...]
@@ -55,6 +57,7 @@ class SweepFit:
     used: Mask
     size: tuple[float, float]
     rms_px: tuple[float, float]
+    excess: float
 
     def sigma(self, index: int) -> float:
         """Return the standard deviation of a parameter."""
@@ -69,12 +72,22 @@ def fit_sweep(sweep: Sweep, *, fixed: frozenset[int] = frozenset()) -> SweepFit:
     where tf has every joint, small errors of the joints' zeros; by how much blur makes tags smaller; and their size.
     Residuals are corners, with their noise and that of arm and motion, which restricted maximum likelihood finds.
     ``fixed`` parameters keep their stated value. What is known beforehand is wide: a parameter that the sweep does
-    not show comes back with a sigma as wide.
+    not show comes back with a sigma as wide. So is the tags' size at first; where the sweep agrees with the stated one,
+    that counts as measured, and the rest is fitted again.
     Raises TagError where the corners determine nothing.
     """
-    problem = Problem.of(sweep, fixed)
     try:
-        return _fit(problem, sweep)
+        problem = Problem.of(sweep, fixed, size_sigma=SIZE_UNKNOWN)
+        start = _start(problem, sweep)
+        stated = problem.residual(start)
+        free = _fit(problem, start, Noise(), np.ones(len(sweep), dtype=bool))
+        found = _described(free, stated)
+        size, sigma = found.size
+        if abs(size) > SIZE_AGREES * math.hypot(sigma, SIZE_SHARE):
+            return found
+        problem = Problem.of(sweep, fixed, size_sigma=SIZE_SHARE)
+        held = _fit(problem, free.state, free.noise, free.used)
+        return dataclasses.replace(_described(held, stated), size=found.size)
     except np.linalg.LinAlgError as error:
         raise TagError(
             f"{sweep.path}: the {len(sweep)} sightings of tags determine no solution ({error}); expected tags of the "
@@ -83,14 +96,21 @@ def fit_sweep(sweep: Sweep, *, fixed: frozenset[int] = frozenset()) -> SweepFit:
         ) from error
 
 
-def _fit(problem: Problem, sweep: Sweep) -> SweepFit:
-    state = _start(problem, sweep)
-    before = problem.residual(state)
-    noise, used = Noise(), np.ones(len(sweep), dtype=bool)
+@dataclasses.dataclass(frozen=True)
+class _Solved:
+    """Where the search ended: the problem about there, the state, the noise, and the sightings that are used."""
+
+    problem: Problem
+    state: State
+    noise: Noise
+    used: Mask
+
+
+def _fit(problem: Problem, state: State, noise: Noise, used: Mask) -> _Solved:
+    """Alternate between the state, the noise, and who is within the gate."""
     for _ in range(12):
         late_s = float(state.values[LATENCY])
-        problem = dataclasses.replace(problem, motion=Motion.at(sweep, late_s))
-        problem = dataclasses.replace(problem, shrinking=inwards(problem.observed, speed_px(problem, state)))
+        problem = problem.around(state)
         state = _minimise(problem, state, used, noise)
         settled = abs(float(state.values[LATENCY]) - late_s) < SETTLED_S
         linear = problem.linearise(state)
@@ -101,28 +121,32 @@ def _fit(problem: Problem, sweep: Sweep) -> SweepFit:
         if settled and shown == noise and (now == used).all():
             break
         noise, used = shown, now
-    state = _minimise(problem, state, used, noise)
+    return _Solved(problem, _minimise(problem, state, used, noise), noise, used)
+
+
+def _described(solved: _Solved, stated: Array) -> SweepFit:
+    """Return the solution with its covariance, widened where residuals exceed their noise; ``stated`` are those (n, 8)
+    before anything was corrected."""
+    problem, state, used = solved.problem, solved.state, solved.used
+    sweep = problem.sweep
     linear = problem.linearise(state)
-    weights, _ = problem.weights(linear, noise)
+    weights, _ = problem.weights(linear, solved.noise)
     matrix, _ = problem.normal(linear, weights, used, state)
     freedom = max(8 * int(used.sum()) - 6 * len(sweep.stands) - len(problem.free), 1)
-    factor = max(1.0, float(chi_square(linear.residual, weights)[used].sum()) / freedom)
+    factor = float(chi_square(linear.residual, weights)[used].sum()) / freedom
     count, first = len(problem.parameters), 6 * len(sweep.stands)
-    inverse: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64) * factor
+    inverse: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64) * max(1.0, factor)
     own = problem.free < count
     inside = first + np.flatnonzero(own)
     covariance = np.zeros((count, count))
     covariance[np.ix_(problem.free[own], problem.free[own])] = inverse[np.ix_(inside, inside)]
     covariance[LATENCY, LATENCY] += (CHORD_INTERVALS * interval_s(sweep)) ** 2
-    size = _without_prior(float(state.values[-1]), float(inverse[-1, -1]), float(problem.prior[-1]) ** 2)
-    old, new = (float(np.sqrt(np.mean(r[used] ** 2))) for r in (before, linear.residual))
-    return SweepFit(problem.parameters, state.values[:count], covariance, noise, used, size, (old, new))
-
-
-def _without_prior(value: float, variance: float, prior: float) -> tuple[float, float]:
-    """Return value and sigma of a number without what was known beforehand, as precision and mean add up."""
-    share = max(1.0 - variance / prior, 1e-6)
-    return value / share, math.sqrt(variance / share)
+    larger = math.exp(float(state.values[-1]))
+    size = larger - 1.0, larger * math.sqrt(float(inverse[-1, -1]))
+    old, new = (float(np.sqrt(np.mean(r[used] ** 2))) for r in (stated, linear.residual))
+    return SweepFit(
+        problem.parameters, state.values[:count], covariance, solved.noise, used, size, (old, new), math.sqrt(factor)
+    )
 
 
 def _start(problem: Problem, sweep: Sweep) -> State:

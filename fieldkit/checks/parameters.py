@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from fieldkit.cameras import Camera
+from fieldkit.errors import TagError
 from fieldkit.frames import Array
 
 _DISTORTION = {True: ("k1", "k2", "k3", "k4"), False: ("k1", "k2", "p1", "p2")}
@@ -29,6 +30,12 @@ class Parameter:
     wide: float
     tolerance: float
     step: float
+
+
+def require_positive(option: str, value: float) -> None:
+    """Raise TagError unless the value of an option is finite and above 0."""
+    if not (math.isfinite(value) and value > 0):
+        raise TagError(f"{option} {value:g}; expected a finite number above 0")
 
 
 def hand_parameters() -> tuple[Parameter, ...]:

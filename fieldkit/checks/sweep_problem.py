@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fieldkit.checks.parameters import (
     Parameter,
@@ -41,6 +42,7 @@ GRID = {
     "arm": (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
     "jitter_s": (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016),
     "blur_s": (0.0, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016),
+    "corner_px": (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2),
 }
 ARM_PER_IMAGE = image_covariance(ArmNoise())
 _TAG_STEP = 1e-5
@@ -48,16 +50,19 @@ _TAG_STEP = 1e-5
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """What residuals may be made of beside the corners' own noise; a still arm shows only the first.
+    """What residuals may be made of beside the corners' own noise; a still arm does not show
+    jitter and blur.
 
     ``arm`` is the factor of the arm's stated standard deviations in one image (`ArmNoise`). ``jitter_s``: an image is
     taken at another time than stated, or between samples of an arm that does not move evenly. ``blur_s``: corners of a
-    moving image err by so many seconds of its motion, each by itself.
+    moving image err by so many seconds of its motion, each by itself. ``corner_px``: corners err by more than their
+    detector states, each by itself: another lens than the model, paper that is not flat.
     """
 
     arm: float = 1.0
     jitter_s: float = GRID["jitter_s"][-1]
     blur_s: float = GRID["blur_s"][-1]
+    corner_px: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +122,7 @@ class Problem:
 
     sweep: Sweep
     observed: Array
-    sigma: Array
+    noise: Array
     points: Array
     parameters: tuple[Parameter, ...]
     free: NDArray[np.int64]
@@ -129,7 +134,8 @@ class Problem:
     motion: Motion
 
     @staticmethod
-    def of(sweep: Sweep, fixed: frozenset[int]) -> Problem:
+    def of(sweep: Sweep, fixed: frozenset[int], *, size_sigma: float = SIZE_SHARE) -> Problem:
+        """State the problem without ``fixed`` parameters; ``size_sigma``: what the tags' sizes are known to."""
         camera = refinable(sweep.camera)
         parameters = (*hand_parameters(), latency_parameter(), *camera_parameters(camera))
         joints = _joint_axes(sweep)
@@ -139,27 +145,62 @@ class Problem:
         return Problem(
             dataclasses.replace(sweep, camera=camera),
             sweep.corners_px,
-            sweep.sigma_px,
+            sweep.noise_px,
             np.stack([tag_corners(sizes[g]) for g in sweep.stand]),
             parameters,
             np.array(free),
             joints,
-            np.array([p.wide for p in parameters] + [JOINT_SIGMA_RAD] * len(joints) + [SHRINK_S, EDGE_PX, SIZE_SHARE]),
+            np.array([p.wide for p in parameters] + [JOINT_SIGMA_RAD] * len(joints) + [SHRINK_S, EDGE_PX, size_sigma]),
             np.array([p.step for p in parameters] + [1e-5] * len(joints) + [1e-4, 1e-2, 1e-5]),
             inwards(sweep.corners_px, None),
             np.zeros((len(sweep), 4, 2)),
             Motion.at(sweep, 0.0),
         )
 
+    def around(self, state: State) -> Problem:
+        """Return the problem with the arm's motion taken where the stamps now are, and the corners' with it."""
+        near = dataclasses.replace(self, motion=Motion.at(self.sweep, float(state.values[LATENCY])))
+        return dataclasses.replace(near, shrinking=inwards(near.observed, speed_px(near, state)))
+
     def cameras(self, values: Array) -> Pose:
         """Return ref_from_cam (n)."""
-        links = self.motion.links(float(values[LATENCY]))
-        zeros = values[len(self.parameters) : -3]
         result = self.sweep.ref_from_body
-        for index, link in enumerate(links):
-            turn = sum((axis * z for (i, axis), z in zip(self.joints, zeros, strict=True) if i == index), np.zeros(3))
-            result = result * link * _exp(np.concatenate([turn, np.zeros(3)]))
+        for link, turn in self._chain(values):
+            result = result * link
+            if turn is not None:
+                result = result * _exp(np.concatenate([turn, np.zeros(3)]))
         return result * _exp(values[HAND])
+
+    def _chain(self, values: Array) -> list[tuple[Pose, Array | None]]:
+        """Return every step's transforms (n), and the small rotation (3,) by which its joint's zero is off, if any."""
+        zeros = values[len(self.parameters) : -3]
+        turns: dict[int, Array] = {}
+        for (i, axis), zero in zip(self.joints, zeros, strict=True):
+            turns[i] = turns.get(i, np.zeros(3)) + zero * axis
+        return [(link, turns.get(i)) for i, link in enumerate(self.motion.links(float(values[LATENCY])))]
+
+    def _turned(self, values: Array) -> list[Array]:
+        """Return by how much (n, 6) the cameras move, in their own frames, with every joint's zero.
+
+        A turn about an axis a through the joint moves a camera at p by a x p. Turns (3,) differ from their derivative
+        by half their product with the axis, and by less than their square.
+        """
+        joint_from_cam, after = _exp(values[HAND]), {}
+        chain = self._chain(values)
+        for i in range(len(chain) - 1, -1, -1):
+            link, turn = chain[i]
+            after[i] = joint_from_cam
+            if turn is not None:
+                joint_from_cam = _exp(np.concatenate([turn, np.zeros(3)])) * joint_from_cam
+            joint_from_cam = link * joint_from_cam
+        moved = []
+        for i, axis in self.joints:
+            turn = chain[i][1]
+            along = axis if turn is None else axis - np.cross(turn, axis) / 2
+            rotation, n = after[i].rotation.inv(), len(self.noise)
+            shift = rotation.apply(np.cross(along, after[i].translation))
+            moved.append(np.hstack([np.broadcast_to(part, (n, 3)) for part in (rotation.apply(along), shift)]))
+        return moved
 
     def predict(self, cameras: Pose, tags: Pose, values: Array) -> Array:
         """Return the corners' pixels (n, 4, 2)."""
@@ -179,38 +220,47 @@ class Problem:
     def linearise(self, state: State) -> Linear:
         """Return residuals and their derivatives, numerically."""
         cameras, values = self.cameras(state.values), state.values
-        n, columns = len(self.sigma), []
+        n, columns = len(self.noise), []
         for d in _TAG_STEP * np.eye(6):
             ahead = self.predict(cameras, state.tags * _exp(d), values)
             columns.append((ahead - self.predict(cameras, state.tags * _exp(-d), values)) / (2 * _TAG_STEP))
-        for k in self.free:
-            columns.append(self.slope(state, cameras, int(k)))
         by_camera = []
         for d in _TAG_STEP * np.eye(6):
             ahead = self.predict(cameras * _exp(d), state.tags, values)
             by_camera.append((ahead - self.predict(cameras * _exp(-d), state.tags, values)) / (2 * _TAG_STEP))
+        by_cameras = np.stack([c.reshape(n, 8) for c in by_camera], axis=2)
+        turned, first = self._turned(values), len(self.parameters)
+        for k in self.free:
+            if 0 <= k - first < len(turned):
+                columns.append(np.einsum("nai,ni->na", by_cameras, turned[k - first]))
+            else:
+                columns.append(self.slope(state, cameras, int(k)))
         return Linear(
             (self.observed - self.predict(cameras, state.tags, values)).reshape(n, 8),
             np.stack([c.reshape(n, 8) for c in columns], axis=2),
-            np.stack([c.reshape(n, 8) for c in by_camera], axis=2),
+            by_cameras,
             self.slope(state, cameras, LATENCY).reshape(n, 8),
         )
 
     def slope(self, state: State, cameras: Pose, k: int) -> Array:
-        """Return the derivative (n, 4, 2) of the predicted pixels by a number."""
+        """Return the derivative (n, 4, 2) of the predicted pixels by a number, not by a joint's zero."""
         step = np.zeros(len(self.prior))
         step[k] = self.steps[k]
         ahead, behind = state.values + step, state.values - step
-        moves = k <= LATENCY or len(self.parameters) <= k < len(self.prior) - 3
-        high = self.predict(self.cameras(ahead) if moves else cameras, state.tags, ahead)
-        low = self.predict(self.cameras(behind) if moves else cameras, state.tags, behind)
+        at = [cameras, cameras]
+        if k == LATENCY:
+            at = [self.cameras(ahead), self.cameras(behind)]
+        elif k < LATENCY:
+            cam_from_hand = _exp(state.values[HAND]).inv()
+            at = [cameras * (cam_from_hand * _exp(v[HAND])) for v in (ahead, behind)]
+        high, low = (self.predict(c, state.tags, v) for c, v in zip(at, (ahead, behind), strict=True))
         return (high - low) / (2 * float(self.steps[k]))
 
     def weights(self, linear: Linear, noise: Noise) -> tuple[Array, Array]:
         """Return the inverse covariance (n, 8, 8) of the residuals and its log determinant (n,)."""
         speed = np.mean(linear.by_time**2, axis=1) * 2
-        own = self.sigma**2 + noise.blur_s**2 * speed
-        total = own[:, None, None] * np.eye(8)
+        alone = noise.corner_px**2 + noise.blur_s**2 * speed
+        total = self.noise + alone[:, None, None] * np.eye(8)
         total = total + noise.arm**2 * linear.by_camera @ ARM_PER_IMAGE @ linear.by_camera.transpose(0, 2, 1)
         total += noise.jitter_s**2 * linear.by_time[:, :, None] * linear.by_time[:, None, :]
         return np.asarray(np.linalg.inv(total)), -np.asarray(np.linalg.slogdet(total)[1])
@@ -252,8 +302,7 @@ class Problem:
 
 def _exp(d: Array) -> Pose:
     """Return Exp of (6,) or (n, 6), as `fieldkit.frames.exp` does for one."""
-    turn = Pose.from_rotation(type(Pose.identity().rotation).from_rotvec(d[..., :3]))
-    return Pose.from_translation(d[..., 3:]) * turn
+    return Pose.from_components(d[..., 3:], Rotation.from_rotvec(d[..., :3]))
 
 
 def _joint_axes(sweep: Sweep) -> tuple[tuple[int, Array], ...]:

@@ -13,9 +13,8 @@ from fieldkit.bags import ArmRecording, Kinematics
 from fieldkit.cameras import Camera
 from fieldkit.errors import FrameError, TagError
 from fieldkit.frames import Array, Pose, Trajectory, pose_error
-from fieldkit.tags import TagDetection, detect
-from fieldkit.tags.detect import COARSE_SIGMA_PX
-from fieldkit.types import Frame, SeenTag
+from fieldkit.tags import TagDetection, tags_in, with_noise
+from fieldkit.types import Frame
 
 Progress = Callable[[str, int, int], None]
 
@@ -43,7 +42,7 @@ class Stand:
 class Sweep:
     """Sightings (n) of tags in stands (g), all by one camera.
 
-    ``t_ns`` stamps, ``stand`` int[n], ``corners_px`` f64[n, 4, 2] and their noise ``sigma_px`` f64[n];
+    ``t_ns`` stamps, ``stand`` int[n], ``corners_px`` f64[n, 4, 2] and their covariance ``noise_px`` f64[n, 8, 8];
     ``ref_from_body`` is how the body swayed since the stand's begin, by odometry. ``left_out`` says what was not
     used, with counts.
     """
@@ -68,9 +67,9 @@ class Sweep:
         return np.stack([d.corners_px for d in self.detections])
 
     @property
-    def sigma_px(self) -> Array:
-        """Noise per axis of the corners f64[n] in pixels."""
-        return np.array([d.sigma_px for d in self.detections])
+    def noise_px(self) -> Array:
+        """Covariance f64[n, 8, 8] of the corners in pixels."""
+        return np.stack([d.noise_px for d in self.detections])
 
 
 def find_sweep(
@@ -82,29 +81,29 @@ def find_sweep(
 ) -> Sweep:
     """Find tags of known sizes (key None: all others) in the images of a recording while the body stands.
 
-    Without odometry the body is taken to stand. Raises TagError when no tag is seen MIN_SIGHTINGS times in one stand.
+    Where there is no image, detections that were recorded stand in. Without odometry the body is taken to stand.
+    Raises TagError when no tag is seen MIN_SIGHTINGS times in one stand.
     """
     frames, left_out = _standing(recording)
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_IMAGES)).astype(int))]
+    wanted = [(tag_id, f) for tag_id in sorted(sizes_m, key=lambda k: (k is None, k)) for f in families]
     found: list[tuple[Frame, TagDetection]] = []
-    other = 0
+    other, before = 0, set[tuple[int, int, str]]()
     for number, frame in enumerate(chosen):
         if progress is not None:
             progress("find tags", number + 1, len(chosen))
         if frame.camera != chosen[0].camera:
             other += 1
             continue
-        seen = detect(frame.read(), frame.camera, families=families) if frame.tags is None else _recorded(frame.tags)
-        ids = [d.id for d in seen]
-        found += [(frame, d) for d in seen if ids.count(d.id) == 1 and (d.id in sizes_m or None in sizes_m)]
+        # Two detectors may have searched one image
+        seen = [d for d in tags_in(frame, wanted) if (frame.t_ns, d.id, d.family) not in before]
+        before |= {(frame.t_ns, d.id, d.family) for d in seen}
+        found += [(frame, d) for d in seen]
     if other:
         left_out["with another calibration than the first"] = other
+    known = with_noise([(d, f.camera, sizes_m[d.id if d.id in sizes_m else None]) for f, d in found])
+    found = [(frame, d) for (frame, _), d in zip(found, known, strict=True)]
     return _group(recording, found, sizes_m, len(chosen), left_out)
-
-
-def _recorded(tags: Sequence[SeenTag]) -> list[TagDetection]:
-    """Return what somebody else's detector found as if it were ours."""
-    return [TagDetection(t.id, t.family or "tag36h11", t.corners_px, COARSE_SIGMA_PX) for t in tags]
 
 
 def _standing(recording: ArmRecording) -> tuple[list[Frame], dict[str, int]]:
@@ -146,10 +145,10 @@ def _group(
 ) -> Sweep:
     """Give every sighting its stand; drop stands with too few sightings."""
     begins = _stand_begins(recording.odometry)
-    members: dict[tuple[int, int], list[tuple[Frame, TagDetection]]] = {}
+    members: dict[tuple[int, int, str], list[tuple[Frame, TagDetection]]] = {}
     for frame, detection in found:
         number = int(np.searchsorted(begins, frame.t_ns, side="right"))
-        members.setdefault((number, detection.id), []).append((frame, detection))
+        members.setdefault((number, detection.id, detection.family), []).append((frame, detection))
     kept = {key: rows for key, rows in members.items() if len(rows) >= MIN_SIGHTINGS}
     few = len(found) - sum(len(rows) for rows in kept.values())
     if few:
@@ -159,7 +158,7 @@ def _group(
     rows = [(k, *row) for k, own in enumerate(kept.values()) for row in own]
     stands = tuple(
         Stand(tag_id, sizes_m[tag_id] if tag_id in sizes_m else sizes_m[None], own[0][0].t_ns)
-        for (_, tag_id), own in kept.items()
+        for (_, tag_id, _), own in kept.items()
     )
     swayed = [_swayed(recording.odometry, stands[k].t_begin_ns, f.t_ns) for k, f, _ in rows]
     return Sweep(

@@ -7,7 +7,16 @@ from fieldkit.tags.families import FAMILIES, check_families
 from fieldkit.tags.fusion import Sighting, TagFix, fuse_sightings
 from fieldkit.tags.joint import image_covariance
 from fieldkit.tags.pose import TagSolution, solve, tag_corners
-from fieldkit.tags.sightings import BodySighting, BodySightings, Place, body_sightings, frames_between, placed_tags
+from fieldkit.tags.sightings import (
+    BodySighting,
+    BodySightings,
+    Place,
+    body_sightings,
+    frames_between,
+    placed_tags,
+    tags_in,
+    with_noise,
+)
 from fieldkit.tags.standing import BodyFix, body_in_map, hand_covariance, locate_body
 
 __all__ = [
@@ -36,4 +45,6 @@ __all__ = [
     "placed_tags",
     "solve",
     "tag_corners",
+    "tags_in",
+    "with_noise",
 ]

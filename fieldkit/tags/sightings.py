@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fieldkit.cameras import Camera
 from fieldkit.errors import FrameError, TagError
 from fieldkit.frames import Array, Pose, Trajectory
 from fieldkit.odometry import PlacedTag, jumps_between, travel
@@ -218,48 +219,48 @@ def _stands(odom_from_body: Sequence[Pose]) -> tuple[list[int], list[int]]:
 
 def _seen(places: Sequence[Place], tags: Sequence[TagPose]) -> tuple[BodySighting, ...]:
     wanted = {(tag.id, tag.family): tag for tag in tags}
-    families = tuple(dict.fromkeys(tag.family for tag in tags))
-    found: list[BodySighting] = []
-    for place in places:
-        frame = place.frame
-        if frame.tags is None:
-            detections = detect(frame.read(), frame.camera, families=families)
-        else:
-            detections = [d for tag in frame.tags if (d := _recorded(tag, tags)) is not None]
-        keys = [(d.id, d.family) for d in detections]
-        found += [
-            BodySighting(d, place)
-            for d, key in zip(detections, keys, strict=True)
-            if key in wanted and keys.count(key) == 1
-        ]
-    return _with_noise(found, wanted)
+    found = [(d, place) for place in places for d in tags_in(place.frame, list(wanted))]
+    known = with_noise([(d, place.frame.camera, wanted[d.id, d.family].size_m) for d, place in found])
+    return tuple(BodySighting(d, place) for d, (_, place) in zip(known, found, strict=True))
 
 
-def _recorded(seen: SeenTag, tags: Sequence[TagPose]) -> TagDetection | None:
-    """Return a recorded detection of a tag that is wanted: by its id alone where the message names no family."""
-    for tag in tags:
-        if tag.id == seen.id and seen.family in (None, tag.family):
-            return TagDetection(
-                tag.id, tag.family, seen.corners_px, math.nan if seen.sigma_px is None else seen.sigma_px
-            )
+def tags_in(frame: Frame, wanted: Sequence[tuple[int | None, str]]) -> list[TagDetection]:
+    """Return the wanted tags (id, or None for all, and family) of a frame: as recorded, else searched in its image.
+
+    A recorded detection that names no family is the first wanted one of its id. Its ``sigma_px`` is NaN where the
+    recording states none, see `with_noise`. A tag that is there twice is left out.
+    """
+    if frame.tags is None:
+        families = tuple(dict.fromkeys(family for _, family in wanted))
+        seen = detect(frame.read(), frame.camera, families=families)
+        detections = [d for d in seen if (d.id, d.family) in wanted or (None, d.family) in wanted]
+    else:
+        detections = [d for tag in frame.tags if (d := _recorded(tag, wanted)) is not None]
+    keys = [(d.id, d.family) for d in detections]
+    return [d for d, key in zip(detections, keys, strict=True) if keys.count(key) == 1]
+
+
+def _recorded(seen: SeenTag, wanted: Sequence[tuple[int | None, str]]) -> TagDetection | None:
+    for tag_id, family in wanted:
+        if tag_id in (None, seen.id) and seen.family in (None, family):
+            sigma_px = math.nan if seen.sigma_px is None else seen.sigma_px
+            return TagDetection(seen.id, family, seen.corners_px, sigma_px)
     return None
 
 
-def _with_noise(found: Sequence[BodySighting], tags: dict[tuple[int, str], TagPose]) -> tuple[BodySighting, ...]:
-    """Give detections of unknown noise the one that their own residuals show: 8 coordinates fit 6 parameters."""
-    unknown = [s for s in found if math.isnan(s.detection.sigma_px)]
+def with_noise(found: Sequence[tuple[TagDetection, Camera, float]]) -> list[TagDetection]:
+    """Return detections, given with camera and tag size in m; those of unknown noise with what all of them show.
+
+    8 coordinates fit 6 parameters: what remains tells.
+    """
     squares, count = MESSAGE_WEIGHT * 2 * MESSAGE_SIGMA_PX**2, MESSAGE_WEIGHT * 2
-    for sighting in unknown:
-        detection = dataclasses.replace(sighting.detection, sigma_px=MESSAGE_SIGMA_PX)
+    for detection, camera, size_m in found:
+        if not math.isnan(detection.sigma_px):
+            continue
         try:
-            own = solve(detection, sighting.place.frame.camera, tags[detection.id, detection.family].size_m)
+            own = solve(dataclasses.replace(detection, sigma_px=MESSAGE_SIGMA_PX), camera, size_m)
         except (TagError, np.linalg.LinAlgError):
             continue
         squares, count = squares + 8 * min(own.rms_px, 10 * MESSAGE_SIGMA_PX) ** 2, count + 2
     sigma = max(math.sqrt(squares / count), MESSAGE_FLOOR_PX)
-    return tuple(
-        s
-        if not math.isnan(s.detection.sigma_px)
-        else dataclasses.replace(s, detection=dataclasses.replace(s.detection, sigma_px=sigma))
-        for s in found
-    )
+    return [d if not math.isnan(d.sigma_px) else dataclasses.replace(d, sigma_px=sigma) for d, _, _ in found]
