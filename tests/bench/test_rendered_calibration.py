@@ -200,6 +200,10 @@ def plain_mean(trial: Trial) -> Pose:
     return mean_pose([p.map_from_cam * solve(p.detections[0], p.camera, SIZE_M).cam_from_tag for p in trial.photos])[0]
 
 
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def line(name: str, found: Sequence[Outcome]) -> str:
     joint, alone, mean = (
         np.array([getattr(o, k) for o in found]) * [1e3, 180 / math.pi] for k in ("joint", "good_alone", "mean")
@@ -214,9 +218,10 @@ def line(name: str, found: Sequence[Outcome]) -> str:
     cells = [
         name,
         f"{middle[0]:.2f} mm {middle[1]:.3f} deg",
-        f"{joint[:, 0].max():.1f} mm {joint[:, 1].max():.2f} deg",
+        f"{rms(joint[:, 0]):.2f} mm {rms(joint[:, 1]):.3f} deg",
         f"{middle[0] / bound[0]:.2f} {middle[1] / bound[1]:.2f}",
         f"{np.median(mean[:, 0]):.2f} mm {np.median(mean[:, 1]):.3f} deg",
+        f"{rms(mean[:, 0]):.2f} mm {rms(mean[:, 1]):.3f} deg",
         f"{ratio[0]:.3f} {ratio[1]:.3f}",
         f"{nees[: math.ceil(0.98 * len(nees)) - 1].mean():.2f}",
         f"{100 * np.mean(nees > 22.46 / 6):.0f} %",
@@ -228,8 +233,8 @@ def line(name: str, found: Sequence[Outcome]) -> str:
 
 
 HEAD = (
-    "| photos | median error | largest | over the bound | plain mean | over good photos alone | NEES/6 | outliers | "
-    "within 2 sigma | all wrong named | no good lost |\n|" + "---|" * 11
+    "| photos | median error | rms | over the bound | plain mean, median | rms | over good photos alone | NEES/6 | outliers | "
+    "within 2 sigma | all wrong named | no good lost |\n|" + "---|" * 12
 )
 
 
