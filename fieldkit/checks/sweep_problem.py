@@ -207,6 +207,10 @@ class Problem:
         cam_from_tag = cameras.inv() * tags[self.sweep.stand]
         turn, shift = cam_from_tag.rotation.as_matrix(), cam_from_tag.translation
         x_in_cam = np.einsum("nij,nkj->nki", turn, math.exp(values[-1]) * self.points) + shift[:, None]
+        return self._image(x_in_cam, values)
+
+    def _image(self, x_in_cam: Array, values: Array) -> Array:
+        """Return the pixels (n, 4, 2) of the corners where they are in the cameras (n, 4, 3)."""
         xy = x_in_cam[..., :2] / np.maximum(x_in_cam[..., 2:], 1e-3)
         camera = changed(self.sweep.camera, values[CAMERA])
         pixels = camera.distort(xy.reshape(-1, 2)) * camera.focal_px + camera.centre_px
@@ -220,15 +224,8 @@ class Problem:
     def linearise(self, state: State) -> Linear:
         """Return residuals and their derivatives, numerically."""
         cameras, values = self.cameras(state.values), state.values
-        n, columns = len(self.noise), []
-        for d in _TAG_STEP * np.eye(6):
-            ahead = self.predict(cameras, state.tags * _exp(d), values)
-            columns.append((ahead - self.predict(cameras, state.tags * _exp(-d), values)) / (2 * _TAG_STEP))
-        by_camera = []
-        for d in _TAG_STEP * np.eye(6):
-            ahead = self.predict(cameras * _exp(d), state.tags, values)
-            by_camera.append((ahead - self.predict(cameras * _exp(-d), state.tags, values)) / (2 * _TAG_STEP))
-        by_cameras = np.stack([c.reshape(n, 8) for c in by_camera], axis=2)
+        by_tags, by_cameras = self._by_poses(cameras, state)
+        n, columns = len(self.noise), list(np.moveaxis(by_tags, 2, 0))
         turned, first = self._turned(values), len(self.parameters)
         for k in self.free:
             if 0 <= k - first < len(turned):
@@ -241,6 +238,24 @@ class Problem:
             by_cameras,
             self.slope(state, cameras, LATENCY).reshape(n, 8),
         )
+
+    def _by_poses(self, cameras: Pose, state: State) -> tuple[Array, Array]:
+        """Return the derivatives (n, 8, 6) of the pixels by right perturbations of the tags and of the cameras."""
+        n, values = len(self.noise), state.values
+        cam_from_tag = cameras.inv() * state.tags[self.sweep.stand]
+        turn, x_in_tag = cam_from_tag.rotation.as_matrix(), math.exp(values[-1]) * self.points
+        x_in_cam = np.einsum("nij,nkj->nki", turn, x_in_tag) + cam_from_tag.translation[:, None]
+        steps = _TAG_STEP * np.eye(3)
+        slopes = [
+            (self._image(x_in_cam + s, values) - self._image(x_in_cam - s, values)) / (2 * _TAG_STEP) for s in steps
+        ]
+        slope = np.stack(slopes, axis=-1)
+        # A turn about an axis a moves x by a x x; a camera's turn moves what it sees the other way
+        by_turn = np.stack([np.cross(axis, x_in_tag) for axis in np.eye(3)], axis=-1)
+        by_other = -np.stack([np.cross(axis, x_in_cam) for axis in np.eye(3)], axis=-1)
+        x_by_tag = turn[:, None] @ np.concatenate([by_turn, np.broadcast_to(np.eye(3), by_turn.shape)], axis=-1)
+        x_by_cam = np.concatenate([by_other, np.broadcast_to(-np.eye(3), by_other.shape)], axis=-1)
+        return (slope @ x_by_tag).reshape(n, 8, 6), (slope @ x_by_cam).reshape(n, 8, 6)
 
     def slope(self, state: State, cameras: Pose, k: int) -> Array:
         """Return the derivative (n, 4, 2) of the predicted pixels by a number, not by a joint's zero."""

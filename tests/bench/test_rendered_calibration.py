@@ -233,8 +233,8 @@ def line(name: str, found: Sequence[Outcome]) -> str:
 
 
 HEAD = (
-    "| photos | median error | rms | over the bound | plain mean, median | rms | over good photos alone | NEES/6 | outliers | "
-    "within 2 sigma | all wrong named | no good lost |\n|" + "---|" * 12
+    "| photos | median error | rms | over the bound | plain mean, median | rms | over good photos alone | NEES/6 | "
+    "outliers | within 2 sigma | all wrong named | no good lost |\n|" + "---|" * 12
 )
 
 
