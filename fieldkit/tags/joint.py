@@ -134,8 +134,9 @@ class Problem:
             jacobian[self.tag_of == k, :, at : at + 6] = by_tag[self.tag_of == k]
         weighted = np.linalg.solve(noise, np.concatenate([jacobian, residual[..., None]], axis=2))
         at_prior = self._deviation(state)
-        normal = np.einsum("nai,naj->ij", jacobian, weighted[..., :-1]) + self.prior
-        gradient = np.einsum("nai,na->i", jacobian, weighted[..., -1]) - self.prior @ at_prior
+        stacked = jacobian.reshape(-1, self.n_unknown).T @ weighted.reshape(-1, self.n_unknown + 1)
+        normal = stacked[:, :-1] + self.prior
+        gradient = stacked[:, -1] - self.prior @ at_prior
         total = float(np.einsum("na,na->", residual, weighted[..., -1]) + at_prior @ self.prior @ at_prior)
         return normal, gradient, total, float(np.linalg.slogdet(noise)[1].sum())
 
