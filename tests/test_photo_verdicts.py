@@ -210,7 +210,7 @@ def _matched(of: Scene, pixels: np.ndarray, cam: Pose):  # type: ignore[no-untyp
 
     known = make_map(np.random.default_rng(0), n_landmarks=10)
     known = dataclasses.replace(known, xyz=of.xyz, xyz_covariance=of.covariance)
-    inliers = Inliers(of.photos[0].landmark.astype(np.int32), pixels, 1.0, np.zeros((6, 6)))
+    inliers = Inliers(of.photos[0].landmark.astype(np.int32), pixels, 1.0)
     return right_matches(inliers, PHOTO, cam, known)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.bags.content import Content, collect
+from fieldkit.bags.content import Content, arm_chain, collect
 from fieldkit.bags.correcting import correct
 from fieldkit.bags.layouts import Layout
 from fieldkit.bags.reading import choose_layout, general_warnings, make_frames, open_source, topic_list
@@ -105,14 +105,7 @@ def _camera_frame(content: Content, layout: Layout) -> str:
 
 
 def _kinematics(path: Path, content: Content, *, body: str, camera: str) -> Kinematics:
-    t_ns = content.images[len(content.images) // 2].t_ns if content.images else content.last_ns
-    try:
-        steps = content.tf.chain(body, camera, t_ns=t_ns)
-    except FrameError as error:
-        raise BagError(
-            f"{path}: {error.message}; expected the arm's transforms from {body!r} to {camera!r} on tf",
-            hint="record /tf and /tf_static together with the images",
-        ) from error
+    t_ns, steps = arm_chain(path, content, body=body, camera=camera)
     if not any(moves for _, _, moves in steps):
         raise BagError(
             f"{path}: no transform between {body!r} and {camera!r} moves; expected the arm's on tf",

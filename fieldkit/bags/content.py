@@ -6,6 +6,7 @@ import bisect
 import dataclasses
 from collections import Counter
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from fieldkit.bags.files import BagFile, Place
 from fieldkit.bags.layouts import Layout
 from fieldkit.bags.tf import TfBuffer, clean_frame
 from fieldkit.cameras import Camera, camera_from_info
-from fieldkit.errors import BagError, FieldkitError
+from fieldkit.errors import BagError, FieldkitError, FrameError
 from fieldkit.frames import Array, Pose, Trajectory, pose
 
 # Message types that may stand on the topics of a layout
@@ -254,3 +255,18 @@ def _add_transforms(content: Content, transforms: Iterable[Any], *, static: bool
                 content.tf.add(parent, child, t_ns, position_m=xyz, quaternion_xyzw=quaternion)
         except FieldkitError:
             content.refused["transforms with impossible numbers"] += 1
+
+
+def arm_chain(path: Path, content: Content, *, body: str, camera: str) -> tuple[int, tuple[tuple[str, str, bool], ...]]:
+    """Return a time in ns within the images, and the steps of tf from body to camera then; see `TfBuffer.chain`.
+
+    Raises BagError where they are not connected.
+    """
+    t_ns = content.images[len(content.images) // 2].t_ns if content.images else content.last_ns
+    try:
+        return t_ns, content.tf.chain(body, camera, t_ns=t_ns)
+    except FrameError as error:
+        raise BagError(
+            f"{path}: {error.message}; expected the arm's transforms from {body!r} to {camera!r} on tf",
+            hint="record /tf and /tf_static together with the images",
+        ) from error

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from fieldkit.bags.content import Content
+from fieldkit.bags.content import Content, arm_chain
 from fieldkit.bags.files import BagFile
 from fieldkit.bags.images import decode_image
 from fieldkit.bags.layouts import Layout
 from fieldkit.bags.tf import clean_frame
 from fieldkit.cameras import Camera
-from fieldkit.errors import BagError, FrameError, suggestion
+from fieldkit.errors import BagError, suggestion
 from fieldkit.frames import Pose
 from fieldkit.store import Corrections, Hand
 
@@ -69,14 +69,7 @@ def _correct_hand(bag: BagFile, content: Content, hand: Hand, name: str, *, layo
             hint="give the hand.toml of this camera",
         )
     body = content.odometry.child or layout.body_frame
-    t_ns = content.images[len(content.images) // 2].t_ns if content.images else content.last_ns
-    try:
-        steps = content.tf.chain(body, child, t_ns=t_ns)
-    except FrameError as error:
-        raise BagError(
-            f"{bag.path}: {error.message}; expected the arm's transforms from {body!r} to {child!r} on tf",
-            hint="record /tf and /tf_static together with the images",
-        ) from error
+    t_ns, steps = arm_chain(bag.path, content, body=body, camera=child)
     above = [frame for frame, _, _ in steps]
     if parent not in above:
         raise BagError(

@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import cv2
 import numpy as np
@@ -194,7 +195,6 @@ def find_tags(
         find_detector(family, detector)
     shots: list[Shot] = []
     rejected: list[TagPhoto] = []
-    seen: set[int] = set()
     for number, photo in enumerate(listed):
         if progress is not None:
             progress("find tags", number + 1, len(listed))
@@ -211,7 +211,6 @@ def find_tags(
         usable = []
         for d in found:
             assert image is not None
-            seen.add(d.id)
             reason = _why_not(d, found, image, sizes_m)
             if reason:
                 rejected.append(TagPhoto(photo.file, d.id, used=False, reason=reason, visit=photo.visit))
@@ -220,23 +219,36 @@ def find_tags(
         if usable:
             shots.append(Shot(photo, tuple(usable), tuple(found)))
     _check_families(folder, shots)
+    if not shots:
+        _refuse_useless(folder, listed, families, sizes_m, rejected)
+    return shots, rejected
+
+
+def _refuse_useless(
+    folder: Path,
+    listed: Sequence[Photo],
+    families: Sequence[str],
+    sizes_m: Mapping[int | None, float],
+    rejected: Sequence[TagPhoto],
+) -> NoReturn:
+    """Raise TagError: no photo has a tag that can be used."""
+    seen = {p.tag_id for p in rejected if p.tag_id >= 0}
     if not seen:
         raise TagError(
             f"{folder}: none of the {len(listed)} photos shows a tag of {', '.join(families)} (for example "
             f"{listed[0].file}: {rejected[0].reason}); expected the tags to be calibrated",
             hint="check the family, and that the tag is whole, sharp and at least 30 pixels wide",
         )
-    if not shots:
-        if rejected and all(p.tag_id in sizes_m or None in sizes_m for p in rejected if p.tag_id >= 0):
-            example = next(p for p in rejected if p.tag_id >= 0)
-            raise TagError(
-                f"{folder}: no tag can be used (for example tag {example.tag_id} in {example.file}: {example.reason})",
-                hint="take sharp photos in which the tag is at least 30 pixels wide, and hangs once",
-            )
+    if all(tag_id in sizes_m or None in sizes_m for tag_id in seen):
+        example = next(p for p in rejected if p.tag_id >= 0)
         raise TagError(
-            f"{folder}: no tag can be used; tags {sorted(seen)} are seen, sizes are given for {_keys(sizes_m)}"
+            f"{folder}: no tag can be used (for example tag {example.tag_id} in {example.file}: {example.reason})",
+            hint="take sharp photos in which the tag is at least 30 pixels wide, and hangs once",
         )
-    return shots, rejected
+    raise TagError(
+        f"{folder}: no tag can be used; tags {sorted(seen)} are seen, sizes are given for {_keys(sizes_m)}",
+        hint="give the size of one of these tags with --size-m",
+    )
 
 
 def _check_families(folder: Path, shots: Sequence[Shot]) -> None:

@@ -14,7 +14,7 @@ from fieldkit.features import extract, feature_kind, working_factor
 from fieldkit.features.matching import match_groups
 from fieldkit.localize.kernels import NOISE_PX
 from fieldkit.localize.matching import stored_descriptors
-from fieldkit.localize.pose import PosedPoints, confidence, estimate_pose, shared_covariance, subset
+from fieldkit.localize.pose import PosedPoints, confidence, estimate_pose
 from fieldkit.localize.retrieval import build_index, most_similar
 from fieldkit.protocol import LocalizerRules
 from fieldkit.types import Estimate, Image, SceneMap
@@ -28,13 +28,12 @@ _MAX_SIDE_PX = 1600
 @dataclasses.dataclass(frozen=True)
 class Inliers:
     """The matches that an estimate rests on: landmarks int[n] of the map, where they are seen f64[n, 2] in the image's
-    pixels, and the noise of these per axis; and what of the estimate's covariance (6x6) all photos of the place share.
+    pixels, and the noise of these per axis.
     """
 
     landmark: NDArray[np.int32]
     pixels: NDArray[np.float64]
     noise_px: float
-    shared: NDArray[np.float64]
 
 
 class Localizer:
@@ -100,8 +99,7 @@ class Localizer:
             return _failed("few_inliers", len(found), n_inliers, seconds), None
         pixels = features.keypoints_px[keypoint[solved.inliers]]
         sure = confidence(pixels, (camera.width, camera.height))
-        shared = shared_covariance(subset(points, solved.inliers), solved.map_from_cam)
-        inliers = Inliers(found[solved.inliers], pixels.astype(np.float64), NOISE_PX / factor, shared)
+        inliers = Inliers(found[solved.inliers], pixels.astype(np.float64), NOISE_PX / factor)
         return Estimate(solved.map_from_cam, solved.covariance, len(found), n_inliers, "ok", sure, seconds), inliers
 
 

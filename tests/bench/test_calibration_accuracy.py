@@ -7,9 +7,7 @@ corners with 0.4 px, unequal and correlated. Nothing here passes or fails.
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,34 +18,20 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from calibration_scenes import SIZE_M, Scene, flip, localize_wrongly, photograph, tilt_deg
+from calibration_table import Outcome, errors, table
 
 from fieldkit.calibrate.adjustment import Landmarks, adjust, adjust_cameras
 from fieldkit.calibrate.geometry import Poses
 from fieldkit.calibrate.locating import LocatedPhoto
 from fieldkit.calibrate.solving import SolvedTag, solve_tags
-from fieldkit.frames import Array, Pose, mean_pose, pose_error
+from fieldkit.frames import Array, Pose, mean_pose
 from fieldkit.frames import log as pose_log
 
 TRIALS = 400
 DRAWS = 50
 
 
-@dataclasses.dataclass(frozen=True)
-class Trial:
-    """Errors (mm, deg) of the joint solution, of the good photos alone and of the plain mean; what the bound draws."""
-
-    joint: tuple[float, float]
-    good_alone: tuple[float, float]
-    mean: tuple[float, float]
-    bound: Array
-    normalised: Array
-    nees: float
-    unnamed: int
-    lost: int
-    seconds: float
-
-
-def run(seed: int, make: Callable[[np.random.Generator], Scene], *, spoil: bool) -> Trial:
+def run(seed: int, make: Callable[[np.random.Generator], Scene], *, spoil: bool) -> Outcome:
     rng = np.random.default_rng([seed, int(spoil)])
     scene = make(rng)
     photos, wrong = list(scene.photos), set()
@@ -59,9 +43,7 @@ def run(seed: int, make: Callable[[np.random.Generator], Scene], *, spoil: bool)
         for i in wrong - {flipped}:
             photos[i] = localize_wrongly(rng, scene, i, distance_m=float(rng.uniform(0.3, 2.0)))
         photos[flipped] = flip(rng, scene, flipped)
-    begin = time.perf_counter()
     (tag,) = solve_tags(photos, scene.xyz, scene.covariance, sizes_m={None: SIZE_M}).tags
-    seconds = time.perf_counter() - begin
     true = scene.map_from_tags[0]
     good = [p for i, p in enumerate(scene.photos) if i not in wrong]
     alone = tag
@@ -71,7 +53,7 @@ def run(seed: int, make: Callable[[np.random.Generator], Scene], *, spoil: bool)
     rejected = {s.sighted.photo for s in tag.sightings if not s.used}
     named = rejected | {s.sighted.photo for s in tag.sightings if s.flipped}
     bound = np.linalg.cholesky(crb(dataclasses.replace(scene, photos=tuple(good)), wrong))
-    return Trial(
+    return Outcome(
         errors(tag.map_from_tag, true),
         errors(alone.map_from_tag, true),
         errors(plain_mean(scene, photos, tag), true),
@@ -80,13 +62,7 @@ def run(seed: int, make: Callable[[np.random.Generator], Scene], *, spoil: bool)
         float(error @ np.linalg.solve(tag.covariance, error)) / 6,
         len(wrong - named),
         len(rejected - wrong),
-        seconds,
     )
-
-
-def errors(estimate: Pose, true: Pose) -> tuple[float, float]:
-    position, angle = pose_error(estimate, true)
-    return 1e3 * position, math.degrees(angle)
 
 
 def crb(scene: Scene, left_out: set[int]) -> Array:
@@ -108,35 +84,6 @@ def plain_mean(scene: Scene, photos: list[LocatedPhoto], tag: SolvedTag) -> Pose
     return mean_pose(poses)[0]
 
 
-def line(name: str, trials: list[Trial]) -> str:
-    joint, alone, mean = (np.array([getattr(t, k) for t in trials]) for k in ("joint", "good_alone", "mean"))
-    drawn = np.concatenate([t.bound for t in trials])
-    crb_mm = 1e3 * np.median(np.linalg.norm(drawn[:, 3:], axis=1))
-    crb_deg = np.degrees(np.median(np.linalg.norm(drawn[:, :3], axis=1)))
-    nees = np.sort([t.nees for t in trials])
-    normalised = np.abs(np.concatenate([t.normalised for t in trials]))
-    middle = np.median(joint, axis=0)
-    ratio = middle / np.median(alone, axis=0)
-    cells = [
-        f"{name:22}",
-        f"{middle[0]:5.2f} mm {middle[1]:.3f} deg",
-        f"{middle[0] / crb_mm:.2f} {middle[1] / crb_deg:.2f}",
-        f"{np.median(mean[:, 0]):7.2f} mm {np.median(mean[:, 1]):6.3f} deg",
-        f"{ratio[0]:.3f} {ratio[1]:.3f}",
-        f"{nees[: math.ceil(0.98 * len(nees))].mean():.2f}",
-        f"{100 * np.mean(nees > 22.46 / 6):4.1f} %",
-        f"{100 * np.mean(normalised < 2):5.1f} %",
-        f"{100 * np.mean([t.unnamed == 0 for t in trials]):5.1f} %",
-        f"{100 * np.mean([t.lost == 0 for t in trials]):5.1f} %",
-        f"{np.median([t.seconds for t in trials]):.3f} s",
-    ]
-    return " | ".join(cells)
-
-
-HEAD = (
-    "scenario | median error | over the bound | plain mean | over good photos alone | NEES/6 (2 % trimmed) | outliers "
-    "(one in a thousand expected) | 2 sigma | all wrong named | no good lost | seconds"
-)
 SCENARIOS: dict[str, tuple[Callable[[np.random.Generator], Scene], bool]] = {
     "5 mm map": (lambda rng: photograph(rng), False),
     "20 mm map": (lambda rng: photograph(rng, map_sigma_m=0.02), False),
@@ -156,7 +103,7 @@ def test_accuracy_of_calibration(benchmark: Any, capsys: pytest.CaptureFixture[s
     make, spoil = SCENARIOS[name]
     trials = benchmark.pedantic(lambda: [run(seed, make, spoil=spoil) for seed in range(TRIALS)], rounds=1)
     with capsys.disabled():
-        print(f"\n{HEAD}\n{line(name, trials)}")  # noqa: T201
+        print("\n" + table({name: trials}))  # noqa: T201
 
 
 def test_optimise_twenty_photos(benchmark: Any) -> None:
