@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, extract, feature_kind, read_grey
+from fieldkit.features import Features, feature_name, open_extractor, read_image
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import (
@@ -51,8 +51,9 @@ class MapOptions:
     """Settings of map building; the defaults suit 50..500 images of rooms.
 
     ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
-    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. ``n_threads`` is by
-    default the number of processors; it does not change the map, and is no part of what the options are told by.
+    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. ``weights`` is a folder
+    where networks' weights are looked for first. ``n_threads`` is by default the number of processors; it does not
+    change the map. Neither is a part of what the options are told by.
     Raises MapError when a length or a count is not positive.
     """
 
@@ -68,6 +69,7 @@ class MapOptions:
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
+    weights: Path | None = dataclasses.field(default=None, repr=False, compare=False)
     n_threads: int | None = dataclasses.field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -125,7 +127,7 @@ def build_map(
     """
     options = MapOptions() if options is None else options
     tell: Progress = progress or (lambda step, done, total: None)
-    feature_kind(feature)
+    feature = feature_name(feature)
     refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
     clock = _Clock()
     walk = read_source(Path(source))
@@ -157,16 +159,20 @@ def build_map(
 
 
 def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progress) -> list[Features]:
+    extractor = open_extractor(
+        feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
+    )
+
     def one(index: int) -> Features:
         image = walk.images[index]
-        grey = read_grey(image.file)
-        if grey.shape != (image.camera.height, image.camera.width):
+        pixels = read_image(image.file, colour=extractor.kind.colour)
+        if pixels.shape[:2] != (image.camera.height, image.camera.width):
             raise MapError(
-                f"{image.file}: is {grey.shape[1]}x{grey.shape[0]}; its camera says "
+                f"{image.file}: is {pixels.shape[1]}x{pixels.shape[0]}; its camera says "
                 f"{image.camera.width}x{image.camera.height}",
                 hint="give every camera images of one size",
             )
-        return extract(grey, feature=feature, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size)
+        return extractor.extract(pixels)
 
     found = []
     with ThreadPoolExecutor(options.n_threads or threads()) as pool:
