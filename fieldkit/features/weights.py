@@ -172,8 +172,8 @@ def download(wanted: WeightFile, out: Path) -> Path:
         found = _sha256(temporary)
         if found != wanted.sha256:
             raise WeightsError(
-                f"{wanted.url}: SHA-256 is {found[:12]}...; expected {wanted.sha256[:12]}... of {wanted.file}: cut off, "
-                "or not this file",
+                f"{wanted.url}: SHA-256 is {found[:12]}...; expected {wanted.sha256[:12]}...: cut off, or not "
+                f"{wanted.file}",
                 hint=f"try again, or {hint}",
             )
         os.replace(temporary, out)

@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, feature_name, open_extractor, read_image
+from fieldkit.features import FeatureKind, Features, feature_kind, feature_name, open_extractor, read_image
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import (
@@ -133,7 +133,7 @@ def build_map(
     walk = read_source(Path(source))
     features = _extract_all(walk, feature, options, tell)
     clock.lap("extract")
-    pairs, matches, disbelieved = _match_all(walk, features, options, seed, tell)
+    pairs, matches, disbelieved = _match_all(walk, features, feature_kind(feature), options, seed, tell)
     clock.lap("match")
     found = _Matched(walk, features, pairs, matches)
     placing = _place(found, options, seed, tell)
@@ -183,7 +183,7 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
 
 
 def _match_all(
-    walk: MapSource, features: list[Features], options: MapOptions, seed: int, tell: Progress
+    walk: MapSource, features: list[Features], kind: FeatureKind, options: MapOptions, seed: int, tell: Progress
 ) -> tuple[list[Pair], list[NDArray[np.uint32]], list[str]]:
     """Return pairs, their matches as far as SLAM's poses allow them, and a warning where SLAM is not believed."""
     pairs = choose_pairs(
@@ -192,7 +192,8 @@ def _match_all(
     matches = match_pairs(
         pairs,
         features,
-        ratio=options.ratio,
+        ratio=options.ratio if kind.matching == "ratio" else 1.0,
+        min_cosine=kind.min_cosine,
         progress=lambda n: tell("match", n, len(pairs)),
         n_threads=options.n_threads or threads(),
     )

@@ -56,13 +56,16 @@ def match_pairs(
     features: Sequence[Features],
     *,
     ratio: float,
+    min_cosine: float = -1.0,
     progress: Callable[[int], None] | None = None,
     n_threads: int = 2,
 ) -> list[NDArray[np.uint32]]:
     """Match the descriptors of every pair; the result does not depend on the number of threads."""
 
     def one(pair: Pair) -> NDArray[np.uint32]:
-        return match_pair(features[pair[0]].descriptors, features[pair[1]].descriptors, ratio=ratio)
+        return match_pair(
+            features[pair[0]].descriptors, features[pair[1]].descriptors, ratio=ratio, min_cosine=min_cosine
+        )
 
     results = []
     with ThreadPoolExecutor(n_threads) as pool:
