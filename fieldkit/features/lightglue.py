@@ -35,7 +35,7 @@ class LightGlue:
         path = find_weights(WEIGHTS[stored], folder=weights)
         from kornia.feature.lightglue import LightGlue as Network
 
-        network = Network(features=None, weights=None, input_dim=FEATURES[name].width)
+        network = Network(features=None, input_dim=FEATURES[name].width)  # type: ignore[arg-type]
         fill_network(network, _renamed(read_weights(path)), path=path)
         self._run = one_at_a_time(network)
 
