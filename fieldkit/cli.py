@@ -18,6 +18,7 @@ from tyro.conf import UseAppendAction as Repeated
 from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
+from fieldkit.map_commands import map_build, map_compact, map_info
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
 from fieldkit.tag_tables import print_second, print_tags, second_json, tags_json
 
@@ -36,62 +37,6 @@ def inspect(recording: Positional[Path], *, layout: str | None = None, json: boo
 
     found = inspect_recording(recording, layout=layout)
     print_json(found) if json else print_mapping(found, title=str(recording))
-
-
-def map_build(
-    source: Positional[Path],
-    *,
-    out: Path,
-    feature: str = "sift",
-    scale: Literal["auto", "slam"] = "auto",
-    voxel_m: float = 0.04,
-    force: bool = False,
-) -> None:
-    """Build a metric map: SfM landmarks from the images, frame and scale from SLAM poses, surface from depth.
-
-    Args:
-        source: mapping folder (rig.toml) or image folder (images/, camera.toml, poses.txt, depth/)
-        out: map folder to write
-        feature: local feature of landmarks
-        scale: auto refines the SLAM poses' scale by calibrated depth images; slam does not
-        voxel_m: edge length of a voxel of the surface
-        force: replace an existing map
-    """
-    from fieldkit import maps
-
-    options = maps.MapOptions(scale=scale, voxel_m=voxel_m)
-    with ProgressBars() as progress:
-        built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
-    for warning in built.warnings:
-        logging.getLogger(__name__).warning("%s: %s", source, warning)
-    print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")
-
-
-def map_info(path: Positional[Path], *, json: bool = False) -> None:
-    """Say what a map holds and how well it was aligned.
-
-    Args:
-        path: map folder
-        json: print JSON
-    """
-    from fieldkit import maps
-
-    found = maps.map_info(path)
-    print_json(found) if json else print_mapping(found, title=str(path))
-
-
-def map_compact(path: Positional[Path], *, out: Path, force: bool = False) -> None:
-    """Write a small copy of a map: one descriptor per landmark, 8 bit, and a thinned surface.
-
-    Args:
-        path: map folder
-        out: map folder to write
-        force: replace an existing map
-    """
-    from fieldkit import maps
-
-    maps.compact_map(path, out, force=force)
-    print_mapping(maps.map_info(out), title=str(out))
 
 
 def tags_calibrate(
