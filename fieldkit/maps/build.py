@@ -16,7 +16,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import FeatureKind, Features, feature_kind, feature_name, open_extractor, read_image
+from fieldkit.features import Features, feature_name, open_extractor, read_image
+from fieldkit.features.matchers import MatcherName, open_matcher
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import (
@@ -51,6 +52,7 @@ class MapOptions:
     """Settings of map building; the defaults suit 50..500 images of rooms.
 
     ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
+    ``n_similar`` is to how many similar images every image is matched, by default what the matcher is fast enough for.
     ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. ``weights`` is a folder
     where networks' weights are looked for first. ``n_threads`` is by default the number of processors; it does not
     change the map. Neither is a part of what the options are told by.
@@ -59,8 +61,9 @@ class MapOptions:
 
     max_keypoints: int = 2048
     max_image_size: int | None = 1600
+    matcher: MatcherName = "nearest"
     ratio: float = 0.8
-    n_similar: int = 20
+    n_similar: int | None = None
     n_neighbours: int = 3
     min_registered: float = 0.5
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
@@ -133,7 +136,7 @@ def build_map(
     walk = read_source(Path(source))
     features = _extract_all(walk, feature, options, tell)
     clock.lap("extract")
-    pairs, matches, disbelieved = _match_all(walk, features, feature_kind(feature), options, seed, tell)
+    pairs, matches, disbelieved = _match_all(walk, features, feature, options, seed, tell)
     clock.lap("match")
     found = _Matched(walk, features, pairs, matches)
     placing = _place(found, options, seed, tell)
@@ -183,17 +186,17 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
 
 
 def _match_all(
-    walk: MapSource, features: list[Features], kind: FeatureKind, options: MapOptions, seed: int, tell: Progress
+    walk: MapSource, features: list[Features], feature: str, options: MapOptions, seed: int, tell: Progress
 ) -> tuple[list[Pair], list[NDArray[np.uint32]], list[str]]:
     """Return pairs, their matches as far as SLAM's poses allow them, and a warning where SLAM is not believed."""
-    pairs = choose_pairs(
-        walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
-    )
+    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
+    n_similar = matcher.n_similar if options.n_similar is None else options.n_similar
+    pairs = choose_pairs(walk.images, features, seed=seed, n_similar=n_similar, n_neighbours=options.n_neighbours)
     matches = match_pairs(
         pairs,
         features,
-        ratio=options.ratio if kind.matching == "ratio" else 1.0,
-        min_cosine=kind.min_cosine,
+        sizes=[(image.camera.width, image.camera.height) for image in walk.images],
+        matcher=matcher,
         progress=lambda n: tell("match", n, len(pairs)),
         n_threads=options.n_threads or threads(),
     )
