@@ -16,8 +16,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, feature_name, open_extractor, read_image
-from fieldkit.features.matchers import MatcherName, open_matcher
+from fieldkit.features import Extractor, Features, feature_name, open_extractor, read_image
+from fieldkit.features.matchers import MatcherName, PairMatcher, open_matcher
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import (
@@ -134,9 +134,13 @@ def build_map(
     refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
     clock = _Clock()
     walk = read_source(Path(source))
-    features = _extract_all(walk, feature, options, tell)
+    extractor = open_extractor(
+        feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
+    )
+    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
+    features = _extract_all(walk, extractor, options, tell)
     clock.lap("extract")
-    pairs, matches, disbelieved = _match_all(walk, features, feature, options, seed, tell)
+    pairs, matches, disbelieved = _match_all(walk, features, matcher, options, seed, tell)
     clock.lap("match")
     found = _Matched(walk, features, pairs, matches)
     placing = _place(found, options, seed, tell)
@@ -161,11 +165,7 @@ def build_map(
     return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, told)
 
 
-def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progress) -> list[Features]:
-    extractor = open_extractor(
-        feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
-    )
-
+def _extract_all(walk: MapSource, extractor: Extractor, options: MapOptions, tell: Progress) -> list[Features]:
     def one(index: int) -> Features:
         image = walk.images[index]
         pixels = read_image(image.file, colour=extractor.kind.colour)
@@ -186,10 +186,9 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
 
 
 def _match_all(
-    walk: MapSource, features: list[Features], feature: str, options: MapOptions, seed: int, tell: Progress
+    walk: MapSource, features: list[Features], matcher: PairMatcher, options: MapOptions, seed: int, tell: Progress
 ) -> tuple[list[Pair], list[NDArray[np.uint32]], list[str]]:
     """Return pairs, their matches as far as SLAM's poses allow them, and a warning where SLAM is not believed."""
-    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
     n_similar = matcher.n_similar if options.n_similar is None else options.n_similar
     pairs = choose_pairs(walk.images, features, seed=seed, n_similar=n_similar, n_neighbours=options.n_neighbours)
     matches = match_pairs(
