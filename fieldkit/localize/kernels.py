@@ -17,7 +17,7 @@ def linearise(pixels, xyz, covariance, focal_px, variance, rotation, position, r
 
     A row is a residual's derivative by the right perturbation of the pose, rotation first (x_in_cam of
     map_from_cam * Exp(w, v) is x_in_cam + [x_in_cam]x w - v to first order), and the residual itself, whitened by its
-    own 2x2 covariance: ``variance`` (px^2) of the pixel plus the landmark's uncertainty projected into the image.
+    own 2x2 covariance: ``variance`` f64[n] (px^2) of the pixel plus the landmark's uncertainty in the image.
     """
     by_point = np.zeros((2, 3))
     spread = np.zeros((2, 2))
@@ -40,7 +40,7 @@ def linearise(pixels, xyz, covariance, focal_px, variance, rotation, position, r
                 )
         for i in range(2):
             for j in range(2):
-                total = variance if i == j else 0.0
+                total = variance[n] if i == j else 0.0
                 for k in range(3):
                     for m in range(3):
                         total += by_landmark[n, i, k] * covariance[n, k, m] * by_landmark[n, j, m]

@@ -15,7 +15,7 @@ from fieldkit.features import Features, extract, feature_kind, working_factor
 from fieldkit.features.matching import match_groups
 from fieldkit.frames import Pose, compose_covariance
 from fieldkit.localize.chance import Agreement, confidence, log_false_alarms
-from fieldkit.localize.matching import stored_descriptors
+from fieldkit.localize.matching import expected_noise, stored_descriptors
 from fieldkit.localize.narrowing import CameraPrior, plausible_images
 from fieldkit.localize.parallel import in_threads
 from fieldkit.localize.pose import PosedPoints, Solved, estimate_pose, residuals_px
@@ -27,6 +27,8 @@ from fieldkit.warp import shared_errors
 
 Array = NDArray[np.float64]
 
+# What `Inliers` say of the noise of pixels of the image worked on
+NOISE_PX = 1.0
 _MAX_KEYPOINTS = 2048
 _MAX_SIDE_PX = 1600
 
@@ -43,7 +45,7 @@ class Query:
 @dataclasses.dataclass(frozen=True)
 class Inliers:
     """The matches that an estimate rests on: landmarks int[n] of the map, where they are seen f64[n, 2] in the image's
-    pixels, and the noise of these per axis.
+    pixels, and a bound on the noise of these per axis.
     """
 
     landmark: NDArray[np.int32]
@@ -87,7 +89,6 @@ class _Found:
     map_from_rig: Pose | None
     covariance: Array | None
     inliers: tuple[NDArray[np.bool_], ...]
-    noise_px: float
     confidence: float
 
 
@@ -199,9 +200,7 @@ class Localizer:
         if found.map_from_rig is None:
             return estimate, None
         rows = found.inliers[0]
-        inliers = Inliers(
-            matched.landmark[rows], matched.pixels[rows].astype(np.float64), found.noise_px / matched.factor
-        )
+        inliers = Inliers(matched.landmark[rows], matched.pixels[rows].astype(np.float64), NOISE_PX / matched.factor)
         return estimate, inliers
 
     def _matches(self, query: Query, rig_from_cam: Pose | None, watch: _Stopwatch, *, threads: int) -> _Matched:
@@ -226,6 +225,7 @@ class Localizer:
         focal_px = np.asarray(camera.focal_px) * factor
         points = PosedPoints(
             camera.unproject(features.keypoints_px[keypoint])[:, :2] * focal_px,
+            expected_noise(self._kind, features.scales[keypoint] * factor),
             self._map.xyz[landmark],
             self._map.xyz_covariance[landmark] * self._shared.sigma_px**2,
             (float(focal_px[0]), float(focal_px[1])),
@@ -252,23 +252,23 @@ class Localizer:
     def _pose(self, matched: Sequence[_Matched]) -> _Found:
         rules, none = self._rules, tuple(np.zeros(len(m.landmark), dtype=bool) for m in matched)
         if max((m.n_keypoints for m in matched), default=0) < rules.min_inliers:
-            return _Found("no_features", None, None, none, 0.0, 0.0)
+            return _Found("no_features", None, None, none, 0.0)
         if sum(len(m.landmark) for m in matched) < rules.min_inliers:
-            return _Found("no_matches", None, None, none, 0.0, 0.0)
+            return _Found("no_matches", None, None, none, 0.0)
         solved = estimate_pose([m.points for m in matched], max_error_px=rules.max_reprojection_px, seed=self._seed)
         if solved is None:
-            return _Found("no_pose", None, None, none, 0.0, 0.0)
+            return _Found("no_pose", None, None, none, 0.0)
         if sum(int(i.sum()) for i in solved.inliers) < rules.min_inliers:
-            return _Found("few_inliers", None, None, solved.inliers, 0.0, 0.0)
+            return _Found("few_inliers", None, None, solved.inliers, 0.0)
         agreements = [
             Agreement(m.pixels.astype(np.float64) * m.factor, residuals_px(m.points, solved.map_from_rig), m.area_px)
             for m in matched
         ]
         sure = confidence(log_false_alarms(agreements, max_error_px=rules.max_reprojection_px))
         if sure < rules.min_confidence:
-            return _Found("low_confidence", None, None, solved.inliers, solved.noise_px, sure)
+            return _Found("low_confidence", None, None, solved.inliers, sure)
         covariance = solved.covariance + self._shared_covariance(matched, solved)
-        return _Found("ok", solved.map_from_rig, covariance, solved.inliers, solved.noise_px, sure)
+        return _Found("ok", solved.map_from_rig, covariance, solved.inliers, sure)
 
     def _shared_covariance(self, matched: Sequence[_Matched], solved: Solved) -> Array:
         """Return what the landmarks are wrong by together does to the pose (6, 6)."""

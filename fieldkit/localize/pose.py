@@ -16,8 +16,10 @@ from fieldkit.localize.kernels import MIN_DEPTH_M, linearise, weighted_sums
 
 Array = NDArray[np.float64]
 
-# Standard deviation of keypoints' pixels before their residuals are seen, and how many matches that belief is worth
-EXPECTED_NOISE_PX, EXPECTED_MATCHES = 0.6, 10.0
+# How many matches the expected noise of the pixels is worth, against that which their residuals show
+EXPECTED_MATCHES = 10.0
+# Multiples of the expected noise within which a pose is first refined and told from others: these are not exact yet
+_FIRST_NOISE = 2.5
 # Residuals of this many standard deviations have half of the weight: 95 % as good as least squares on Gaussian ones
 _SCALE = 3.0
 # Median of chi-square with 2 degrees of freedom
@@ -29,11 +31,13 @@ _STARTS = (1.0, 0.3, 0.12)
 
 @dataclasses.dataclass(frozen=True)
 class PosedPoints:
-    """Matches of a camera: undistorted pixels from the principal point (n, 2), landmarks (n, 3), their covariances
-    (n, 3, 3), and the focal lengths in px; ``rig_from_cam`` where the camera is one of a rig.
+    """Matches of a camera: undistorted pixels from the principal point (n, 2), their expected noise per axis in px (n),
+    landmarks (n, 3), their covariances (n, 3, 3), and the focal lengths in px; ``rig_from_cam`` where the camera is
+    one of a rig.
     """
 
     pixels: Array
+    sigma_px: Array
     xyz: Array
     xyz_covariance: Array
     focal_px: tuple[float, float]
@@ -43,8 +47,8 @@ class PosedPoints:
 @dataclasses.dataclass(frozen=True)
 class Solved:
     """map_from_rig (of one camera: map_from_cam), its 6x6 covariance (right perturbation, rotation first), bool[n]
-    inliers of each camera, the pixels' noise that the residuals show, and how the pose follows the matched landmarks
-    of all cameras, f64[6, 3n].
+    inliers of each camera, the multiple of the expected noise that the residuals show, and how the pose follows the
+    matched landmarks of all cameras, f64[6, 3n].
 
     The covariance has the pixels' noise and every landmark's own; not what landmarks are wrong by together.
     """
@@ -52,7 +56,7 @@ class Solved:
     map_from_rig: Pose
     covariance: Array
     inliers: tuple[NDArray[np.bool_], ...]
-    noise_px: float
+    noise: float
     response: Array
 
 
@@ -86,36 +90,42 @@ def estimate_pose(cameras: Sequence[PosedPoints], *, max_error_px: float, seed: 
         return None if solved is None else _carried(solved, cameras, with_matches[0].rig_from_cam.inv())
     starts = [_ransac(cameras, max_error_px=max_error_px * share, seed=seed) for share in _STARTS]
     refined = [
-        refine_pose(_subsets(cameras, inliers), start, noise_px=1.0, scale=1.0)[0]
+        refine_pose(_subsets(cameras, inliers), start, noise=_FIRST_NOISE, scale=1.0)[0]
         for start, inliers in (s for s in starts if s is not None)
     ]
     if not refined:
         return None
-    best = min(refined, key=lambda pose: _linear(cameras, pose, 1.0).sums(1.0)[2])
+    best = _cheapest(cameras, refined)
+    other = _mirrored(_subsets(cameras, _inliers(cameras, best, max_error_px)), best)
+    if other is not None:
+        kept = _subsets(cameras, _inliers(cameras, other, 2.0 * max_error_px))
+        if sum(len(c.xyz) for c in kept) >= 4:
+            best = _cheapest(cameras, [best, refine_pose(kept, other, noise=_FIRST_NOISE, scale=1.0)[0]])
     inliers = _inliers(cameras, best, max_error_px)
     if sum(int(i.sum()) for i in inliers) < 4:
         return None
     kept = _subsets(cameras, inliers)
-    noise_px = shown_noise(kept, best)
-    map_from_rig, covariance, response = refine_pose(kept, best, noise_px=noise_px)
+    noise = shown_noise(kept, best)
+    map_from_rig, covariance, response = refine_pose(kept, best, noise=noise)
     every = np.zeros((6, sum(len(c.xyz) for c in cameras), 3))
     every[:, np.concatenate(inliers)] = response.reshape(6, -1, 3)
     inliers = _inliers(cameras, map_from_rig, max_error_px)
-    return Solved(map_from_rig, covariance, inliers, noise_px, every.reshape(6, -1))
+    return Solved(map_from_rig, covariance, inliers, noise, every.reshape(6, -1))
 
 
 def refine_pose(
-    cameras: Sequence[PosedPoints], map_from_rig: Pose, *, noise_px: float, scale: float = _SCALE, iterations: int = 20
+    cameras: Sequence[PosedPoints], map_from_rig: Pose, *, noise: float, scale: float = _SCALE, iterations: int = 20
 ) -> tuple[Pose, Array, Array]:
     """Refine a pose on its inliers by reweighted Gauss-Newton; return it, its 6x6 covariance, and f64[6, 3n].
 
-    Every residual is whitened by its own 2x2 covariance: ``noise_px`` plus the landmark's uncertainty projected into
-    the image; those of ``scale`` standard deviations have half of the weight. The covariance is that of an M-estimator
-    (Huber and Ronchetti, Robust Statistics, 7.6) whose noise is the residuals', pooled with the expected; it takes
-    the landmarks' errors as independent. The last is how the pose follows the landmarks.
+    Every residual is whitened by its own 2x2 covariance: ``noise`` times the expected one plus the landmark's
+    uncertainty projected into the image; those of ``scale`` standard deviations have half of the weight. The
+    covariance is that of an M-estimator (Huber and Ronchetti, Robust Statistics, 7.6) whose noise is the residuals',
+    pooled with the expected; it takes the landmarks' errors as independent. The last is how the pose follows the
+    landmarks.
     """
     for _ in range(iterations):
-        information, gradient, _ = _linear(cameras, map_from_rig, noise_px).sums(scale**2)
+        information, gradient, _ = _linear(cameras, map_from_rig, noise).sums(scale**2)
         step = np.linalg.lstsq(information, -gradient, rcond=None)[0]
         rotation = map_from_rig.rotation
         map_from_rig = Pose.from_components(
@@ -123,7 +133,7 @@ def refine_pose(
         )
         if float(np.abs(step).max()) < 1e-9:
             break
-    linear = _linear(cameras, map_from_rig, noise_px)
+    linear = _linear(cameras, map_from_rig, noise)
     # For weights 1 / (1 + r^2 / c^2) in two dimensions the mean derivative of the weighted residual is that of their
     # squares, too.
     slope = (1.0 + linear.squared / scale**2) ** -2
@@ -136,34 +146,57 @@ def refine_pose(
 
 
 def shown_noise(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
-    """Return the standard deviation of the pixels per axis that half of the residuals show, pooled with the expected.
+    """Return the multiple of the pixels' expected noise that half of the residuals show, pooled with the expected one.
 
     The landmarks' own uncertainty is taken off.
     """
-    count, variance = sum(len(c.xyz) for c in cameras), EXPECTED_NOISE_PX**2
-    shown = variance
+    count, shown = sum(len(c.xyz) for c in cameras), 1.0
     for _ in range(4):
         squared = _linear(cameras, map_from_rig, math.sqrt(shown)).squared
         shown = max(shown * float(np.median(squared)) / _MEDIAN_CHI2, 0.01)
-    return math.sqrt((count * shown + EXPECTED_MATCHES * variance) / (count + EXPECTED_MATCHES))
+    return math.sqrt((count * shown + EXPECTED_MATCHES) / (count + EXPECTED_MATCHES))
 
 
-def _linear(cameras: Sequence[PosedPoints], map_from_rig: Pose, noise_px: float) -> _Linear:
-    rows, by_landmark = zip(*(_linear_camera(c, map_from_rig, noise_px) for c in cameras), strict=True)
-    return (
-        _Linear(np.concatenate(rows), np.concatenate(by_landmark))
-        if len(rows) > 1
-        else _Linear(rows[0], by_landmark[0])
-    )
+def _cheapest(cameras: Sequence[PosedPoints], poses: Sequence[Pose]) -> Pose:
+    return min(poses, key=lambda pose: _linear(cameras, pose, _FIRST_NOISE).sums(1.0)[2])
 
 
-def _linear_camera(camera: PosedPoints, map_from_rig: Pose, noise_px: float) -> tuple[Array, Array]:
+def _mirrored(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> Pose | None:
+    """Return the pose that shows the plane of the landmarks nearly the same: tilted the other way; None without one.
+
+    Schweighofer and Pinz 2006, Robust Pose Estimation from a Planar Target.
+    """
+    xyz = np.concatenate([c.xyz for c in cameras])
+    if len(xyz) < 4:
+        return None
+    centre = xyz.mean(axis=0)
+    normal = np.linalg.svd(xyz - centre, full_matrices=False)[2][2]
+    sight = centre - map_from_rig.translation
+    sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
+    axis = np.cross(sight, normal)
+    sine, cosine = float(np.linalg.norm(axis)), float(sight @ normal)
+    if sine < 1e-3:
+        return None
+    # The plane would turn by twice its tilt against the line of sight; here the camera turns about it instead
+    tilt = 2.0 * math.atan2(sine, cosine)
+    turn = Rotation.from_rotvec(axis / sine * tilt)
+    about = Pose.from_components(centre - turn.apply(centre), turn)
+    return about * map_from_rig
+
+
+def _linear(cameras: Sequence[PosedPoints], map_from_rig: Pose, noise: float) -> _Linear:
+    rows, by_landmark = zip(*(_linear_camera(c, map_from_rig, noise) for c in cameras), strict=True)
+    return _Linear(np.concatenate(rows), np.concatenate(by_landmark))
+
+
+def _linear_camera(camera: PosedPoints, map_from_rig: Pose, noise: float) -> tuple[Array, Array]:
     pose = map_from_rig if camera.rig_from_cam is None else map_from_rig * camera.rig_from_cam
     rows, by_landmark = np.empty((len(camera.xyz), 2, 7)), np.empty((len(camera.xyz), 2, 3))
-    given = (camera.pixels, camera.xyz, camera.xyz_covariance, np.asarray(camera.focal_px))
+    variance = (noise * camera.sigma_px) ** 2
+    given = (camera.pixels, camera.xyz, camera.xyz_covariance, np.asarray(camera.focal_px), variance)
     points = [np.ascontiguousarray(a, dtype=np.float64) for a in given]
     rotation, position = np.ascontiguousarray(pose.rotation.as_matrix()), np.array(pose.translation)
-    linearise(*points, noise_px**2, rotation, position, rows, by_landmark)
+    linearise(*points, rotation, position, rows, by_landmark)
     if camera.rig_from_cam is not None:
         rows[:, :, :6] = rows[:, :, :6] @ adjoint(camera.rig_from_cam.inv())
     return rows, by_landmark
@@ -177,7 +210,7 @@ def _carried(solved: Solved, cameras: Sequence[PosedPoints], cam_from_rig: Pose)
         solved.map_from_rig * cam_from_rig,
         transport @ solved.covariance @ transport.T,
         inliers,
-        solved.noise_px,
+        solved.noise,
         transport @ solved.response,
     )
 
@@ -245,5 +278,9 @@ def _subsets(cameras: Sequence[PosedPoints], inliers: Sequence[NDArray[np.bool_]
 def subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
     """Return the matches in ``rows`` bool[n]."""
     return dataclasses.replace(
-        points, pixels=points.pixels[rows], xyz=points.xyz[rows], xyz_covariance=points.xyz_covariance[rows]
+        points,
+        pixels=points.pixels[rows],
+        sigma_px=points.sigma_px[rows],
+        xyz=points.xyz[rows],
+        xyz_covariance=points.xyz_covariance[rows],
     )
