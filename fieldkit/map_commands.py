@@ -20,6 +20,8 @@ def map_build(
     *,
     out: Path,
     feature: str = "sift",
+    matcher: Literal["nearest", "lightglue"] = "nearest",
+    weights: Path | None = None,
     scale: Literal["auto", "slam"] = "auto",
     voxel_m: float = 0.04,
     force: bool = False,
@@ -29,14 +31,16 @@ def map_build(
     Args:
         source: mapping folder (rig.toml) or image folder (images/, camera.toml, poses.txt, depth/)
         out: map folder to write
-        feature: local feature of landmarks
+        feature: local feature of landmarks: sift, sift_l2, akaze, aliked, xfeat, superpoint
+        matcher: how pairs of mapping images are matched: nearest neighbours, or lightglue (aliked only, slow)
+        weights: folder where the weights of networks are looked for first
         scale: auto refines the SLAM poses' scale by calibrated depth images; slam does not
         voxel_m: edge length of a voxel of the surface
         force: replace an existing map
     """
     from fieldkit import maps
 
-    options = maps.MapOptions(scale=scale, voxel_m=voxel_m)
+    options = maps.MapOptions(matcher=matcher, weights=weights, scale=scale, voxel_m=voxel_m)
     with ProgressBars() as progress:
         built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
     for warning in built.warnings:

@@ -16,7 +16,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, extract, feature_kind, read_grey
+from fieldkit.features import Extractor, Features, feature_name, open_extractor, read_image
+from fieldkit.features.matchers import MatcherName, PairMatcher, open_matcher
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import (
@@ -51,15 +52,18 @@ class MapOptions:
     """Settings of map building; the defaults suit 50..500 images of rooms.
 
     ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
-    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. ``n_threads`` is by
-    default the number of processors; it does not change the map, and is no part of what the options are told by.
+    ``n_similar`` is to how many similar images every image is matched, by default what the matcher is fast enough for.
+    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. ``weights`` is a folder
+    where networks' weights are looked for first. ``n_threads`` is by default the number of processors; it does not
+    change the map. Neither is a part of what the options are told by.
     Raises MapError when a length or a count is not positive.
     """
 
     max_keypoints: int = 2048
     max_image_size: int | None = 1600
+    matcher: MatcherName = "nearest"
     ratio: float = 0.8
-    n_similar: int = 20
+    n_similar: int | None = None
     n_neighbours: int = 3
     min_registered: float = 0.5
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
@@ -68,6 +72,7 @@ class MapOptions:
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
+    weights: Path | None = dataclasses.field(default=None, repr=False, compare=False)
     n_threads: int | None = dataclasses.field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -125,13 +130,17 @@ def build_map(
     """
     options = MapOptions() if options is None else options
     tell: Progress = progress or (lambda step, done, total: None)
-    feature_kind(feature)
+    feature = feature_name(feature)
     refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
     clock = _Clock()
     walk = read_source(Path(source))
-    features = _extract_all(walk, feature, options, tell)
+    extractor = open_extractor(
+        feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
+    )
+    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
+    features = _extract_all(walk, extractor, options, tell)
     clock.lap("extract")
-    pairs, matches, disbelieved = _match_all(walk, features, options, seed, tell)
+    pairs, matches, disbelieved = _match_all(walk, features, matcher, options, seed, tell)
     clock.lap("match")
     found = _Matched(walk, features, pairs, matches)
     placing = _place(found, options, seed, tell)
@@ -156,17 +165,17 @@ def build_map(
     return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, told)
 
 
-def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progress) -> list[Features]:
+def _extract_all(walk: MapSource, extractor: Extractor, options: MapOptions, tell: Progress) -> list[Features]:
     def one(index: int) -> Features:
         image = walk.images[index]
-        grey = read_grey(image.file)
-        if grey.shape != (image.camera.height, image.camera.width):
+        pixels = read_image(image.file, colour=extractor.kind.colour)
+        if pixels.shape[:2] != (image.camera.height, image.camera.width):
             raise MapError(
-                f"{image.file}: is {grey.shape[1]}x{grey.shape[0]}; its camera says "
+                f"{image.file}: is {pixels.shape[1]}x{pixels.shape[0]}; its camera says "
                 f"{image.camera.width}x{image.camera.height}",
                 hint="give every camera images of one size",
             )
-        return extract(grey, feature=feature, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size)
+        return extractor.extract(pixels)
 
     found = []
     with ThreadPoolExecutor(options.n_threads or threads()) as pool:
@@ -177,16 +186,16 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
 
 
 def _match_all(
-    walk: MapSource, features: list[Features], options: MapOptions, seed: int, tell: Progress
+    walk: MapSource, features: list[Features], matcher: PairMatcher, options: MapOptions, seed: int, tell: Progress
 ) -> tuple[list[Pair], list[NDArray[np.uint32]], list[str]]:
     """Return pairs, their matches as far as SLAM's poses allow them, and a warning where SLAM is not believed."""
-    pairs = choose_pairs(
-        walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
-    )
+    n_similar = matcher.n_similar if options.n_similar is None else options.n_similar
+    pairs = choose_pairs(walk.images, features, seed=seed, n_similar=n_similar, n_neighbours=options.n_neighbours)
     matches = match_pairs(
         pairs,
         features,
-        ratio=options.ratio,
+        sizes=[(image.camera.width, image.camera.height) for image in walk.images],
+        matcher=matcher,
         progress=lambda n: tell("match", n, len(pairs)),
         n_threads=options.n_threads or threads(),
     )
