@@ -4,7 +4,7 @@ from fieldkit.maps.build import MapOptions, MapReport, build_map
 from fieldkit.maps.compact import compact_map
 from fieldkit.maps.gauge import Gauge, fit_gauge
 from fieldkit.maps.io import content_digest, load_map, map_info
-from fieldkit.maps.warp import MapWarp, map_warp
+from fieldkit.warp import MapWarp, map_warp
 
 __all__ = [
     "Gauge",
