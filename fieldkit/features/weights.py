@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import http.client
@@ -10,7 +11,7 @@ import os
 import tempfile
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -114,6 +115,24 @@ def find_weights(wanted: WeightFile, *, folder: Path | None = None) -> Path:
             return cached
         cached.unlink()
     return download(wanted, cached)
+
+
+@contextlib.contextmanager
+def weights_first_in(folder: Path | None) -> Iterator[None]:
+    """Look for weights in ``folder`` first while inside, also in processes that are started there; None does nothing.
+
+    It stands in FIELDKIT_WEIGHTS so long: for a whole command, whose steps open networks in several places.
+    """
+    before = os.environ.get("FIELDKIT_WEIGHTS")
+    if folder is not None:
+        os.environ["FIELDKIT_WEIGHTS"] = str(folder)
+    try:
+        yield
+    finally:
+        if folder is not None and before is None:
+            del os.environ["FIELDKIT_WEIGHTS"]
+        elif folder is not None and before is not None:
+            os.environ["FIELDKIT_WEIGHTS"] = before
 
 
 def cache_folder() -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import LocalizeError
-from fieldkit.features import read_grey
+from fieldkit.features import read_image
 from fieldkit.localize import Localizer
 from fieldkit.types import Estimate
 
@@ -33,13 +33,13 @@ def localize_files(
         )
     result = []
     for number, file in enumerate(files, start=1):
-        grey = read_grey(file)
-        if grey.shape != (camera.height, camera.width):
+        pixels = read_image(file, colour=localizer.takes_colour)
+        if pixels.shape[:2] != (camera.height, camera.width):
             raise LocalizeError(
-                f"{file}: is {grey.shape[1]}x{grey.shape[0]}; the camera says {camera.width}x{camera.height}",
+                f"{file}: is {pixels.shape[1]}x{pixels.shape[0]}; the camera says {camera.width}x{camera.height}",
                 hint="give the camera with which the image was taken",
             )
-        result.append((file.name, localizer.localize(grey, camera)))
+        result.append((file.name, localizer.localize(pixels, camera)))
         if progress is not None:
             progress("localize", number, len(files))
     return result

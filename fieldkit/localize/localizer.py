@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import LocalizeError
-from fieldkit.features import Features, extract, feature_kind, working_factor
+from fieldkit.features import Features, open_extractor, working_factor
 from fieldkit.features.matching import match_groups
 from fieldkit.frames import Pose, compose_covariance
 from fieldkit.localize.chance import Agreement, confidence, log_false_alarms
@@ -108,11 +109,19 @@ class _Stopwatch:
 class Localizer:
     """Localize images in one map: retrieval, matching against landmarks, PnP.
 
-    The map is indexed once, here. ``localize`` keeps no state: the same image gives the same pose bit for bit,
-    whatever was localized before, and with one or several threads.
+    The map is indexed, and a network loaded, once, here; ``weights`` is a folder where its weights are looked for first.
+    ``localize`` keeps no state: the same image gives the same pose bit for bit, whatever was localized before, and with
+    one or several threads.
     """
 
-    def __init__(self, scene_map: SceneMap, rules: LocalizerRules | None = None, *, seed: int = 0) -> None:
+    def __init__(
+        self,
+        scene_map: SceneMap,
+        rules: LocalizerRules | None = None,
+        *,
+        seed: int = 0,
+        weights: Path | None = None,
+    ) -> None:
         if not len(scene_map.xyz) or not len(scene_map.descriptors):
             raise LocalizeError(
                 f"{scene_map.path}: the map has no landmarks with descriptors", hint="build the map again"
@@ -120,9 +129,17 @@ class Localizer:
         self._map = scene_map
         self._rules = LocalizerRules() if rules is None else rules
         self._seed = seed
-        self._kind = feature_kind(scene_map.feature)
+        self._extractor = open_extractor(
+            scene_map.feature, weights=weights, max_keypoints=_MAX_KEYPOINTS, max_side_px=_MAX_SIDE_PX
+        )
+        self._kind = self._extractor.kind
         self._index = build_index(scene_map, seed=seed)
         self._shared = shared_errors(scene_map)
+
+    @property
+    def takes_colour(self) -> bool:
+        """Whether the map's feature looks at colours."""
+        return self._kind.colour
 
     def localize(self, image: Image, camera: Camera, *, prior: CameraPrior | None = None) -> Estimate:
         """Find map_from_cam of an image uint8[h, w] or RGB; a failure is an Estimate without a pose and its reason.
@@ -212,7 +229,7 @@ class Localizer:
                 hint="give the camera with which the image was taken",
             )
         rules = self._rules
-        features = extract(image, feature=self._map.feature, max_keypoints=_MAX_KEYPOINTS, max_side_px=_MAX_SIDE_PX)
+        features = self._extractor.extract(image)
         watch.stop("extract")
         keypoint, landmark = np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
         if len(features) >= rules.min_inliers:
