@@ -109,9 +109,9 @@ class _Stopwatch:
 class Localizer:
     """Localize images in one map: retrieval, matching against landmarks, PnP.
 
-    The map is indexed, and a network loaded, once, here; ``weights`` is a folder where its weights are looked for first.
-    ``localize`` keeps no state: the same image gives the same pose bit for bit, whatever was localized before, and with
-    one or several threads.
+    The map is indexed, and a network loaded, once, here; ``weights`` is a folder where its weights are looked for
+    first. ``localize`` keeps no state: the same image gives the same pose bit for bit, whatever was localized before,
+    and with one or several threads.
     """
 
     def __init__(
