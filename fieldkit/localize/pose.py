@@ -17,7 +17,7 @@ from fieldkit.localize.kernels import MIN_DEPTH_M, linearise, weighted_sums
 Array = NDArray[np.float64]
 
 # How many matches the expected noise of the pixels is worth, against that which their residuals show
-EXPECTED_MATCHES = 10.0
+EXPECTED_MATCHES = 40.0
 # Multiples of the expected noise within which a pose is first refined and told from others: these are not exact yet
 _FIRST_NOISE = 2.5
 # Poses whose cost is higher by this count e times less
@@ -91,10 +91,8 @@ def estimate_pose(cameras: Sequence[PosedPoints], *, max_error_px: float, seed: 
         solved = estimate_pose([alone], max_error_px=max_error_px, seed=seed)
         return None if solved is None else _carried(solved, cameras, with_matches[0].rig_from_cam.inv())
     starts = [_ransac(cameras, max_error_px=max_error_px * share, seed=seed) for share in _STARTS]
-    refined = [
-        refine_pose(_subsets(cameras, inliers), start, noise=_FIRST_NOISE, scale=1.0)[0]
-        for start, inliers in (s for s in starts if s is not None)
-    ]
+    settled = (_settled(cameras, *start, max_error_px) for start in starts if start is not None)
+    refined = [pose for pose in settled if pose is not None]
     if not refined:
         return None
     costs = [_cost(cameras, pose) for pose in refined]
@@ -155,6 +153,18 @@ def shown_noise(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
         shown = max(shown * float(np.median(squared)) / _MEDIAN_CHI2, 0.01)
     shown *= count / max(count - 3.0, 1.0)
     return math.sqrt((count * shown + EXPECTED_MATCHES) / (count + EXPECTED_MATCHES))
+
+
+def _settled(
+    cameras: Sequence[PosedPoints], map_from_rig: Pose, inliers: Sequence[NDArray[np.bool_]], max_error_px: float
+) -> Pose | None:
+    """Return where a pose settles: starts that mean the same pose end at the same one."""
+    for _ in range(2):
+        map_from_rig = refine_pose(_subsets(cameras, inliers), map_from_rig, noise=_FIRST_NOISE, scale=1.0)[0]
+        inliers = _inliers(cameras, map_from_rig, max_error_px)
+        if sum(int(i.sum()) for i in inliers) < 4:
+            return None
+    return map_from_rig
 
 
 def _cost(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
