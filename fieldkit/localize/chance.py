@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,13 @@ _SAMPLE = 3
 _CELL_PX = 8.0
 # Residuals below this are taken for this: keypoints are no more exact
 _LEAST_PX = 1.0
-# Logistic regression of "right" on the logarithm below
-_MIDDLE, _WIDTH = 10.0, 3.0
+# Decades of chance that matches lose when they are crowded e times closer: a poster or a socket that hangs elsewhere,
+# too, agrees in all its keypoints. Set, as the two below, on rendered queries of five scenes in each other's maps
+_CROWDED = 6.0
+# Half of the queries with this many decades of evidence are right, one in e fewer with this many less
+_MIDDLE, _WIDTH = -3.0, 3.0
+# Matches that miss by less say where in the image the pose is seen to be right
+_NEAR_PX = 4.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +38,7 @@ class Agreement:
     area_px: float
 
 
-def log_false_alarms(cameras: list[Agreement], *, max_error_px: float) -> float:
+def log_false_alarms(cameras: Sequence[Agreement], *, max_error_px: float) -> float:
     """Return log10 of the expected number of poses on which random matches would agree as these do.
 
     The matches are as many, every one of them is anywhere in the image, and the best number of them is looked for:
@@ -55,9 +61,24 @@ def log_false_alarms(cameras: list[Agreement], *, max_error_px: float) -> float:
     return float(log_alarms.min()) / math.log(10.0)
 
 
-def confidence(log_alarms: float) -> float:
-    """Return 0..1, the probability that a pose is right, from what `log_false_alarms` says of it."""
-    return float(1.0 / (1.0 + math.exp(min((log_alarms + _MIDDLE) / _WIDTH, 700.0))))
+def confidence(cameras: Sequence[Agreement], *, max_error_px: float) -> float:
+    """Return 0..1, the probability that a pose is right, from how little chance explains its matches.
+
+    Crowded matches, or those in a row, say less than as many all over the image. Repeated places, and things that
+    were moved, are not chance: no single image tells them.
+    """
+    spread = max(_narrow_spread(c) for c in cameras)
+    evidence = -log_false_alarms(cameras, max_error_px=max_error_px) + _CROWDED * math.log(spread)
+    return float(1.0 / (1.0 + math.exp(min(max(-(evidence - _MIDDLE) / _WIDTH, -700.0), 700.0))))
+
+
+def _narrow_spread(camera: Agreement) -> float:
+    """Return the smaller standard deviation of matches over the image, in sides of a square as large as the image."""
+    near = camera.pixels[camera.residual_px <= _NEAR_PX]
+    if len(near) <= _SAMPLE:
+        return 1e-3
+    narrow = float(np.linalg.eigvalsh(np.cov(near.T))[0])
+    return max(math.sqrt(max(narrow, 1.0) / camera.area_px), 1e-3)
 
 
 def _log_choose(n: int | NDArray[np.int64], k: NDArray[np.int64]) -> Array:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import LocalizeError
-from fieldkit.features import Features, open_extractor, working_factor
-from fieldkit.features.matching import match_groups
+from fieldkit.features import open_extractor, working_factor
 from fieldkit.frames import Pose, compose_covariance
-from fieldkit.localize.chance import Agreement, confidence, log_false_alarms
-from fieldkit.localize.matching import expected_noise, stored_descriptors
+from fieldkit.localize.chance import Agreement, confidence
+from fieldkit.localize.matching import expected_noise, landmark_noise, open_matcher
 from fieldkit.localize.narrowing import CameraPrior, plausible_images
 from fieldkit.localize.parallel import in_threads
 from fieldkit.localize.pose import PosedPoints, Solved, estimate_pose, residuals_px
@@ -109,9 +108,9 @@ class _Stopwatch:
 class Localizer:
     """Localize images in one map: retrieval, matching against landmarks, PnP.
 
-    The map is indexed, and a network loaded, once, here; ``weights`` is a folder where its weights are looked for
-    first. ``localize`` keeps no state: the same image gives the same pose bit for bit, whatever was localized before,
-    and with one or several threads.
+    The map is indexed once, here, and the networks of its feature, if it has any, are loaded: ``weights`` is a folder
+    where these are looked for first. ``localize`` keeps no state: the same image gives the same pose bit for bit,
+    whatever was localized before, and with one or several threads.
     """
 
     def __init__(
@@ -133,12 +132,13 @@ class Localizer:
             scene_map.feature, weights=weights, max_keypoints=_MAX_KEYPOINTS, max_side_px=_MAX_SIDE_PX
         )
         self._kind = self._extractor.kind
+        self._match = open_matcher(scene_map, self._kind, self._rules, weights=weights)
         self._index = build_index(scene_map, seed=seed)
         self._shared = shared_errors(scene_map)
 
     @property
-    def takes_colour(self) -> bool:
-        """Whether the map's feature looks at colours."""
+    def colour(self) -> bool:
+        """Whether the map's feature looks at colours: give it RGB images then."""
         return self._kind.colour
 
     def localize(self, image: Image, camera: Camera, *, prior: CameraPrior | None = None) -> Estimate:
@@ -160,7 +160,11 @@ class Localizer:
 
         Images are taken from ``queries`` as they are needed. Raises as `localize` does.
         """
-        return in_threads(lambda query: self._localize(query, threads=1)[0], queries, threads=threads)
+        return in_threads(self.localize_query, queries, threads=threads)
+
+    def localize_query(self, query: Query) -> Estimate:
+        """Localize as `localize` does, in the calling thread alone: for callers that have several."""
+        return self._localize(query, threads=1)[0]
 
     def localize_rig(
         self,
@@ -236,35 +240,23 @@ class Localizer:
             among = None if query.prior is None else plausible_images(self._map, query.prior, camera)
             images = most_similar(self._index, features.descriptors, count=rules.top_k, among=among)
             watch.stop("retrieve")
-            keypoint, landmark = self._match(features, images, threads=threads)
+            size = camera.width, camera.height
+            keypoint, landmark = self._match(features, size, self._index, images, threads)
             watch.stop("match")
         factor = working_factor(image.shape[:2], max_side_px=_MAX_SIDE_PX)
         focal_px = np.asarray(camera.focal_px) * factor
+        sigma_px = expected_noise(self._kind, features.scales[keypoint] * factor)
+        grown = self._shared.sigma_px * landmark_noise(self._kind, sigma_px)
         points = PosedPoints(
             camera.unproject(features.keypoints_px[keypoint])[:, :2] * focal_px,
-            expected_noise(self._kind, features.scales[keypoint] * factor),
+            sigma_px,
             self._map.xyz[landmark],
-            self._map.xyz_covariance[landmark] * self._shared.sigma_px**2,
+            self._map.xyz_covariance[landmark] * grown[:, None, None] ** 2,
             (float(focal_px[0]), float(focal_px[1])),
             rig_from_cam,
         )
         area_px = camera.width * camera.height * factor**2
         return _Matched(landmark, features.keypoints_px[keypoint], points, factor, area_px, len(features))
-
-    def _match(
-        self, features: Features, images: NDArray[np.int32], *, threads: int
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        stored, landmark = stored_descriptors(self._map, self._index, images)
-        by_ratio = self._kind.matching == "ratio"
-        keypoint, found, _ = match_groups(
-            features.descriptors,
-            stored,
-            landmark,
-            ratio=self._rules.ratio if by_ratio else 1.0,
-            mutual=not by_ratio,
-            threads=threads,
-        )
-        return keypoint, found
 
     def _pose(self, matched: Sequence[_Matched]) -> _Found:
         rules, none = self._rules, tuple(np.zeros(len(m.landmark), dtype=bool) for m in matched)
@@ -277,11 +269,8 @@ class Localizer:
             return _Found("no_pose", None, None, none, 0.0)
         if sum(int(i.sum()) for i in solved.inliers) < rules.min_inliers:
             return _Found("few_inliers", None, None, solved.inliers, 0.0)
-        agreements = [
-            Agreement(m.pixels.astype(np.float64) * m.factor, residuals_px(m.points, solved.map_from_rig), m.area_px)
-            for m in matched
-        ]
-        sure = confidence(log_false_alarms(agreements, max_error_px=rules.max_reprojection_px))
+        agreements = [_agreement(m, residuals_px(m.points, solved.map_from_rig)) for m in matched]
+        sure = confidence(agreements, max_error_px=rules.max_reprojection_px)
         if sure < rules.min_confidence:
             return _Found("low_confidence", None, None, solved.inliers, sure)
         covariance = solved.covariance + self._shared_covariance(matched, solved)
@@ -295,6 +284,10 @@ class Localizer:
         np.add.at(response, position, solved.response.reshape(6, -1, 3).transpose(1, 0, 2))
         moved = response.any(axis=(1, 2))
         return self._shared.covariance(landmark[moved], response[moved].transpose(1, 0, 2).reshape(6, -1))
+
+
+def _agreement(matched: _Matched, residual_px: Array) -> Agreement:
+    return Agreement(matched.pixels.astype(np.float64) * matched.factor, residual_px, matched.area_px)
 
 
 def _prior_of(map_from_rig: CameraPrior, rig_from_cam: Pose) -> CameraPrior:

@@ -11,15 +11,17 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fieldkit.frames import Pose, adjoint
+from fieldkit.frames import Pose, adjoint, log
 from fieldkit.localize.kernels import MIN_DEPTH_M, linearise, weighted_sums
 
 Array = NDArray[np.float64]
 
 # How many matches the expected noise of the pixels is worth, against that which their residuals show
-EXPECTED_MATCHES = 10.0
+EXPECTED_MATCHES = 40.0
 # Multiples of the expected noise within which a pose is first refined and told from others: these are not exact yet
 _FIRST_NOISE = 2.5
+# Poses whose cost is higher by this count e times less
+_UNDECIDED = 5.0
 # Residuals of this many standard deviations have half of the weight: 95 % as good as least squares on Gaussian ones
 _SCALE = 3.0
 # Median of chi-square with 2 degrees of freedom
@@ -89,18 +91,12 @@ def estimate_pose(cameras: Sequence[PosedPoints], *, max_error_px: float, seed: 
         solved = estimate_pose([alone], max_error_px=max_error_px, seed=seed)
         return None if solved is None else _carried(solved, cameras, with_matches[0].rig_from_cam.inv())
     starts = [_ransac(cameras, max_error_px=max_error_px * share, seed=seed) for share in _STARTS]
-    refined = [
-        refine_pose(_subsets(cameras, inliers), start, noise=_FIRST_NOISE, scale=1.0)[0]
-        for start, inliers in (s for s in starts if s is not None)
-    ]
+    settled = (_settled(cameras, *start, max_error_px) for start in starts if start is not None)
+    refined = [pose for pose in settled if pose is not None]
     if not refined:
         return None
-    best = _cheapest(cameras, refined)
-    other = _mirrored(_subsets(cameras, _inliers(cameras, best, max_error_px)), best)
-    if other is not None:
-        kept = _subsets(cameras, _inliers(cameras, other, 2.0 * max_error_px))
-        if sum(len(c.xyz) for c in kept) >= 4:
-            best = _cheapest(cameras, [best, refine_pose(kept, other, noise=_FIRST_NOISE, scale=1.0)[0]])
+    costs = [_cost(cameras, pose) for pose in refined]
+    best = refined[int(np.argmin(costs))]
     inliers = _inliers(cameras, best, max_error_px)
     if sum(int(i.sum()) for i in inliers) < 4:
         return None
@@ -110,6 +106,7 @@ def estimate_pose(cameras: Sequence[PosedPoints], *, max_error_px: float, seed: 
     every = np.zeros((6, sum(len(c.xyz) for c in cameras), 3))
     every[:, np.concatenate(inliers)] = response.reshape(6, -1, 3)
     inliers = _inliers(cameras, map_from_rig, max_error_px)
+    covariance = covariance + _between(map_from_rig, refined, costs)
     return Solved(map_from_rig, covariance, inliers, noise, every.reshape(6, -1))
 
 
@@ -154,34 +151,36 @@ def shown_noise(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
     for _ in range(4):
         squared = _linear(cameras, map_from_rig, math.sqrt(shown)).squared
         shown = max(shown * float(np.median(squared)) / _MEDIAN_CHI2, 0.01)
+    shown *= count / max(count - 3.0, 1.0)
     return math.sqrt((count * shown + EXPECTED_MATCHES) / (count + EXPECTED_MATCHES))
 
 
-def _cheapest(cameras: Sequence[PosedPoints], poses: Sequence[Pose]) -> Pose:
-    return min(poses, key=lambda pose: _linear(cameras, pose, _FIRST_NOISE).sums(1.0)[2])
+def _settled(
+    cameras: Sequence[PosedPoints], map_from_rig: Pose, inliers: Sequence[NDArray[np.bool_]], max_error_px: float
+) -> Pose | None:
+    """Return where a pose settles: starts that mean the same pose end at the same one."""
+    for _ in range(2):
+        map_from_rig = refine_pose(_subsets(cameras, inliers), map_from_rig, noise=_FIRST_NOISE, scale=1.0)[0]
+        inliers = _inliers(cameras, map_from_rig, max_error_px)
+        if sum(int(i.sum()) for i in inliers) < 4:
+            return None
+    return map_from_rig
 
 
-def _mirrored(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> Pose | None:
-    """Return the pose that shows the plane of the landmarks nearly the same: tilted the other way; None without one.
+def _cost(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
+    """Return the Cauchy cost of all matches, right and wrong, at a pose."""
+    return _linear(cameras, map_from_rig, _FIRST_NOISE).sums(1.0)[2]
 
-    Schweighofer and Pinz 2006, Robust Pose Estimation from a Planar Target.
+
+def _between(map_from_rig: Pose, others: Sequence[Pose], costs: Sequence[float]) -> Array:
+    """Return the 6x6 covariance of not knowing which of the poses that were found is the right one.
+
+    Small planes and short rows of landmarks are seen nearly the same from several places, and what is wrong with a
+    map or a camera, not noise, decides which of these fits best.
     """
-    xyz = np.concatenate([c.xyz for c in cameras])
-    if len(xyz) < 4:
-        return None
-    centre = xyz.mean(axis=0)
-    normal = np.linalg.svd(xyz - centre, full_matrices=False)[2][2]
-    sight = centre - map_from_rig.translation
-    sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
-    axis = np.cross(sight, normal)
-    sine, cosine = float(np.linalg.norm(axis)), float(sight @ normal)
-    if sine < 1e-3:
-        return None
-    # The plane would turn by twice its tilt against the line of sight; here the camera turns about it instead
-    tilt = 2.0 * math.atan2(sine, cosine)
-    turn = Rotation.from_rotvec(axis / sine * tilt)
-    about = Pose.from_components(centre - turn.apply(centre), turn)
-    return about * map_from_rig
+    weights = np.exp(-(np.asarray(costs) - min(costs)) / _UNDECIDED)
+    offsets = np.stack([log(map_from_rig.inv() * other) for other in others])
+    return np.asarray(np.einsum("n,ni,nj->ij", weights / weights.sum(), offsets, offsets))
 
 
 def _linear(cameras: Sequence[PosedPoints], map_from_rig: Pose, noise: float) -> _Linear:
