@@ -126,7 +126,7 @@ def load_map(path: Path) -> SceneMap:
     entry = read_map_file(path)
     if entry.feature not in FEATURES:
         raise MapError(f"{path}: built with feature {entry.feature!r}", hint=suggestion(entry.feature, list(FEATURES)))
-    _refuse_changed(path, entry)
+    refuse_changed(path, entry)
     model = read_model(path / "sparse")
     width = FEATURES[entry.feature].width
     descriptors, rows = read_landmark_descriptors(path / "features.h5", model, width=width)
@@ -152,7 +152,7 @@ def load_map(path: Path) -> SceneMap:
     )
 
 
-def _refuse_changed(path: Path, entry: MapFile) -> None:
+def refuse_changed(path: Path, entry: MapFile) -> None:
     """Raise MapError when files are missing or are not those that map.toml's digest was made of.
 
     COLMAP may read a cut-off model without an error, and results name the digest as what they were made with.
