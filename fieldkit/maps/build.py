@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, extract, feature_kind, read_grey
+from fieldkit.features import Features, extract, feature_kind
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
 from fieldkit.maps.io import (
@@ -33,8 +33,9 @@ from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
 from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
 from fieldkit.maps.plausible import SlamRules, plausible_matches, plausible_pairs
 from fieldkit.maps.sfm import reconstruct, relative_poses, threads
-from fieldkit.maps.source import DepthFrame, MapSource, read_source
+from fieldkit.maps.source import DepthFrame, MapSource, along_axis, read_image
 from fieldkit.maps.strays import contradicting, strays
+from fieldkit.maps.streamrecorder import open_source
 from fieldkit.store import atomic_folder
 from fieldkit.store.files import refuse_existing
 from fieldkit.surface import fuse_depth, write_ply
@@ -128,7 +129,7 @@ def build_map(
     feature_kind(feature)
     refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
     clock = _Clock()
-    walk = read_source(Path(source))
+    walk = open_source(Path(source))
     features = _extract_all(walk, feature, options, tell)
     clock.lap("extract")
     pairs, matches, disbelieved = _match_all(walk, features, options, seed, tell)
@@ -152,14 +153,14 @@ def build_map(
         places = _alignment_entry(alignment), _surface_entry(surface, options)
         write_map_file(folder, MapFile(1, digest, feature, *counts, *places))
     clock.lap("write")
-    told = (*disbelieved, *warnings, *left_out, *missing)
+    told = (*walk.notes, *disbelieved, *warnings, *left_out, *missing)
     return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, told)
 
 
 def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progress) -> list[Features]:
     def one(index: int) -> Features:
         image = walk.images[index]
-        grey = read_grey(image.file)
+        grey = read_image(image)
         if grey.shape != (image.camera.height, image.camera.width):
             raise MapError(
                 f"{image.file}: is {grey.shape[1]}x{grey.shape[0]}; its camera says "
@@ -390,7 +391,7 @@ class _DepthReader:
                 f"{self.frame.file}: expected a 16-bit PNG of {self.width}x{self.height} in mm",
                 hint="check the depth image and the depth camera's size",
             )
-        return np.asarray(depth, dtype=np.uint16)
+        return along_axis(np.asarray(depth, dtype=np.uint16), self.frame)
 
 
 def _write(

@@ -5,10 +5,15 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
+from fieldkit.features import read_grey
 from fieldkit.frames import Pose
 from fieldkit.store import read_camera, read_rig, read_tum
+from fieldkit.types import Image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".bmp")
 # Images with a SLAM pose that fix scale and frame of a map.
@@ -19,7 +24,8 @@ MIN_POSES = 3
 class SourceImage:
     """One mapping image: name below images/, file, camera, sequence (one camera's walk), frame, and SLAM pose.
 
-    ``rig_from_cam`` is known for a rig's images; those with the same ``frame`` were taken at the same time.
+    ``rig_from_cam`` is known for a rig's images; those with the same ``frame`` were taken at the same time. ``turns``
+    are the quarter turns, counter-clockwise, by which the file's picture is turned away from the camera's.
     """
 
     name: str
@@ -29,24 +35,40 @@ class SourceImage:
     frame: str
     slam_from_cam: Pose | None
     rig_from_cam: Pose | None = None
+    turns: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
 class DepthFrame:
-    """A depth image and the mapping images from whose poses its own follows: (index, cam_from_depth) each."""
+    """A depth image and the mapping images from whose poses its own follows: (index, cam_from_depth) each.
+
+    Where the file holds distances along the pixels' rays, ``ray_z`` f64[h, w] are the z of these unit rays.
+    """
 
     file: Path
     anchors: tuple[tuple[int, Pose], ...]
+    ray_z: NDArray[np.float64] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class MapSource:
-    """All mapping images (sorted by sequence and frame), and the depth images if there are any."""
+    """All mapping images (sorted by sequence and frame), the depth images if any, and what a user should know."""
 
     path: Path
     images: tuple[SourceImage, ...]
     depth_camera: Camera | None
     depth: tuple[DepthFrame, ...]
+    notes: tuple[str, ...] = ()
+
+
+def read_image(image: SourceImage) -> Image:
+    """Read a mapping image as its camera sees it, uint8[h, w]; raises FeatureError when it cannot be read."""
+    return np.ascontiguousarray(np.rot90(read_grey(image.file), -image.turns))
+
+
+def along_axis(depth_mm: NDArray[np.uint16], frame: DepthFrame) -> NDArray[np.uint16]:
+    """Return depth along the optical axis (mm) of what a depth image's file holds."""
+    return depth_mm if frame.ray_z is None else np.rint(depth_mm * frame.ray_z).astype(np.uint16)
 
 
 def read_source(path: Path) -> MapSource:
