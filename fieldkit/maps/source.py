@@ -12,7 +12,8 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
 from fieldkit.features import read_grey
 from fieldkit.frames import Pose
-from fieldkit.store import read_camera, read_rig, read_tum
+from fieldkit.maps.stamps import NamedPoses
+from fieldkit.store import calibration_file, read_camera, read_rig, read_tum
 from fieldkit.types import Image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".bmp")
@@ -84,7 +85,7 @@ def read_source(path: Path) -> MapSource:
         )
     if not (path / "images").is_dir():
         raise MapError(f"{path}: no folder images/; expected it with the mapping images", hint="put them there")
-    source = _read_rig_folder(path) if (path / "rig.toml").is_file() else _read_image_folder(path)
+    source = _read_rig_folder(path) if calibration_file(path, "rig").is_file() else _read_image_folder(path)
     if not source.images:
         raise MapError(
             f"{path / 'images'}: no image found; expected files like {', '.join(IMAGE_SUFFIXES[:3])}",
@@ -101,7 +102,7 @@ def read_source(path: Path) -> MapSource:
 
 
 def _poses_file(path: Path) -> Path:
-    return path / ("slam_poses.txt" if (path / "rig.toml").is_file() else "poses.txt")
+    return path / ("slam_poses.txt" if calibration_file(path, "rig").is_file() else "poses.txt")
 
 
 def _image_files(folder: Path) -> list[Path]:
@@ -109,7 +110,7 @@ def _image_files(folder: Path) -> list[Path]:
 
 
 def _read_rig_folder(path: Path) -> MapSource:
-    rig = read_rig(path / "rig.toml")
+    rig = read_rig(calibration_file(path, "rig"))
     poses = _poses(_poses_file(path))
     images: list[SourceImage] = []
     frames: dict[str, list[tuple[int, Pose]]] = {}
@@ -136,7 +137,7 @@ def _read_rig_folder(path: Path) -> MapSource:
 
 
 def _read_image_folder(path: Path) -> MapSource:
-    camera = read_camera(path / "camera.toml")
+    camera = read_camera(calibration_file(path, "camera"))
     poses = _poses(_poses_file(path))
     images = []
     for file in _image_files(path / "images"):
@@ -167,7 +168,7 @@ def _refuse_duplicates(path: Path, images: list[SourceImage]) -> None:
         seen[image.frame] = image.name
 
 
-def _poses(path: Path) -> dict[str, Pose]:
+def _poses(path: Path) -> NamedPoses:
     if not path.is_file():
         raise MapError(
             f"{path}: no such file; expected SLAM poses, which give the map its scale and gravity",
@@ -179,4 +180,4 @@ def _poses(path: Path) -> dict[str, Pose]:
         names = [name for name, _ in rows]
         twice = next(name for name in names if names.count(name) > 1)
         raise MapError(f"{path}: {twice} has two poses; expected one per name", hint="take one of them out")
-    return poses
+    return NamedPoses(rows)
