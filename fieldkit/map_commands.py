@@ -44,6 +44,80 @@ def map_build(
     print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")
 
 
+def map_import(
+    model: Positional[Path],
+    *,
+    out: Path,
+    images: Path | None = None,
+    feature: str = "sift",
+    poses: Path | None = None,
+    scale: float | None = None,
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z",
+    features: Path | None = None,
+    database: Path | None = None,
+    mesh: Path | None = None,
+    mesh_transform: Path | None = None,
+    mesh_unit: Literal["m", "cm", "mm", "ft", "in"] = "m",
+    mesh_up: Literal["y", "z"] = "z",
+    mesh_voxel_m: float | None = None,
+    min_images: int = 4,
+    force: bool = False,
+) -> None:
+    """Make a map of a COLMAP or hloc model: metric frame, landmarks with descriptors, and a mesh as surface.
+
+    Args:
+        model: COLMAP model, binary or text, such as sparse/0 or hloc's sfm
+        out: map folder to write
+        images: folder that the model's image names start from
+        feature: local feature of the descriptors
+        poses: TUM poses of the model's images, z up: give scale and frame
+        scale: metres per unit of the model, where there are no poses: 1 for a metric model
+        up: axis of the model that points up, with --scale
+        features: features.h5 with which hloc made the model; by default descriptors are extracted from the images
+        database: COLMAP database with which the model was made
+        mesh: PLY, OBJ, GLB or STL file as surface
+        mesh_transform: file with map_from_mesh: a 4x4 matrix or a TUM line
+        mesh_unit: unit of the mesh
+        mesh_up: axis of the mesh that points up
+        mesh_voxel_m: resolution of the mesh; by default its median edge, within 0.01..0.10 m
+        min_images: images that have to see a point to make it a landmark
+        force: replace an existing map
+    """
+    from fieldkit import maps
+
+    meshed = None if mesh is None else maps.ForeignMesh(mesh, mesh_transform, mesh_unit, mesh_up, mesh_voxel_m)
+    rules = maps.LandmarkRules(min_images=min_images)
+    options = maps.ImportOptions(feature, poses, scale, up, features, database, meshed, rules)
+    with ProgressBars() as progress:
+        built = maps.import_map(model, out, images=images, options=options, force=force, progress=progress)
+    for warning in built.warnings:
+        _log.warning("%s: %s", model, warning)
+    print_mapping(maps.map_info(out), title=f"{out}: {built.n_landmarks} landmarks of {built.n_registered} images")
+
+
+def map_export(
+    path: Positional[Path],
+    *,
+    to: Literal["colmap", "hloc", "tum"],
+    out: Path,
+    force: bool = False,
+) -> None:
+    """Write a map as a COLMAP model, as hloc's model and features, or as TUM poses of its images.
+
+    Args:
+        path: map folder
+        to: tool or format
+        out: folder to write
+        force: replace an existing export
+    """
+    from fieldkit import maps
+
+    written = maps.export_map(path, out, to=to, force=force)
+    _log.info(
+        "wrote %s: %d images, %d landmarks: %s", out, written.n_images, written.n_landmarks, ", ".join(written.files)
+    )
+
+
 def map_info(path: Positional[Path], *, json: bool = False) -> None:
     """Say what a map holds and how well it was aligned.
 

@@ -14,9 +14,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, extract, feature_kind, read_grey
+from fieldkit.features import Features, extract, feature_kind
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity
+from fieldkit.maps.checking import check_images, content
 from fieldkit.maps.framing import refuse_unscaled
 from fieldkit.maps.io import (
     AlignmentEntry,
@@ -34,9 +35,10 @@ from fieldkit.maps.placing import Matched, place_images
 from fieldkit.maps.plausible import plausible_matches
 from fieldkit.maps.record import write_record
 from fieldkit.maps.sfm import threads
-from fieldkit.maps.source import MapSource, SourceImage, read_depth, read_source, without_poses
+from fieldkit.maps.source import MapSource, SourceImage, read_depth, read_image, without_poses
 from fieldkit.maps.stages import Stages, resumed, shares
 from fieldkit.maps.strays import strays
+from fieldkit.maps.streamrecorder import open_source
 from fieldkit.store import atomic_folder, digest, library_versions
 from fieldkit.store.files import refuse_existing
 from fieldkit.surface import fuse_depth, read_ply, write_ply
@@ -69,11 +71,12 @@ def build_map(
     tell: Progress = progress or (lambda step, done, total: None)
     feature_kind(feature)
     refuse_existing(out, force=force, marker="map.toml", kind="folder")
-    walk = read_source(Path(source))
+    walk = open_source(Path(source))
     refuse_unscaled(walk, options)
+    check_images(walk)
     walk = without_poses(walk) if options.poses == "none" else walk
     versions = library_versions()
-    key = digest(feature, repr(options), repr((seed, versions)), *_content(walk))
+    key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
     with resumed(out, key) as stages:
         with stages.timed("extract"):
             features = _extract_all(walk, feature, stages, options, tell)
@@ -87,7 +90,7 @@ def build_map(
         with stages.timed("surface"):
             surface, missing = _surface(walk, mapped, stages, options, tell)
         counts = (len(walk.images), len(mapped), n_landmarks)
-        told = (*found.disbelieved, *placing.warnings, *left_out, *missing)
+        told = (*walk.notes, *found.disbelieved, *placing.warnings, *left_out, *missing)
         with stages.timed("write"), atomic_folder(out, force=force, marker="map.toml") as folder:
             _write(folder, walk, model, features, mapped, surface)
             made = content_digest(folder)
@@ -98,15 +101,10 @@ def build_map(
     return MapReport(str(out), made, *counts, alignment, surface is not None, dict(stages.seconds), told)
 
 
-def _content(walk: MapSource) -> list[str | Path]:
-    """Return names and files of all that a source is read from."""
-    return [part for file in walk.files for part in (str(file.relative_to(walk.path)), file)]
-
-
 def _extract_all(walk: MapSource, feature: str, stages: Stages, options: MapOptions, tell: Progress) -> list[Features]:
     def make(image: SourceImage) -> dict[str, NDArray[np.generic]]:
         found = extract(
-            read_grey(image.file),
+            read_image(image),
             feature=feature,
             max_keypoints=options.max_keypoints,
             max_side_px=options.max_image_size,

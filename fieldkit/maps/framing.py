@@ -10,14 +10,13 @@ import pycolmap
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
-from fieldkit.features import read_grey
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, Verdict, align_to_slam
 from fieldkit.maps.known import known_alignment
 from fieldkit.maps.landmarks import model_arrays
 from fieldkit.maps.metric import DepthScale, depth_scale, rescaled, with_depth_scale
 from fieldkit.maps.options import MapOptions, Progress
-from fieldkit.maps.source import MIN_POSES, MapSource, poses_path, read_depth
+from fieldkit.maps.source import MIN_POSES, MapSource, poses_path, read_depth, read_image
 from fieldkit.maps.tagged import TagScale, tag_scale
 from fieldkit.maps.upright import Upright, find_upright, up_rotation
 from fieldkit.tags import TagDetection, detect
@@ -121,7 +120,7 @@ def _tags(
     sightings: list[tuple[Pose, Camera, TagDetection]] = []
     for done, (i, pose) in enumerate(sfm_poses.items(), start=1):
         image = walk.images[i]
-        for found in detect(read_grey(image.file), image.camera, families=options.tag_families):
+        for found in detect(read_image(image), image.camera, families=options.tag_families):
             sightings.append((pose, image.camera, found))
         progress("tags", done, len(sfm_poses))
     return tag_scale(sightings, options.tag_sizes_m, seed=seed)

@@ -17,12 +17,11 @@ from fieldkit.features import Features
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment
 from fieldkit.maps.framing import find_frame
-from fieldkit.maps.io import read_model
 from fieldkit.maps.known import triangulate
 from fieldkit.maps.options import MapOptions, Progress
 from fieldkit.maps.pairs import Pair
 from fieldkit.maps.plausible import SlamRules, plausible_pairs
-from fieldkit.maps.sfm import reconstruct, relative_poses, threads, write_verified
+from fieldkit.maps.sfm import quiet_colmap, reconstruct, relative_poses, threads, write_verified
 from fieldkit.maps.source import MapSource
 from fieldkit.maps.stages import Stages
 from fieldkit.maps.strays import contradicting
@@ -101,7 +100,8 @@ def place_once(
                 f"models-{name}",
                 lambda part: _write_models(part, reconstruct(database, walk.images, seed=seed, progress=progress)),
             )
-        model = read_model(folder / "0")
+        with quiet_colmap():
+            model = pycolmap.Reconstruction(folder / "0")
         poses, pieces = _registered(walk, model, folder, options)
     with stages.timed("align"):
         alignment, warnings = find_frame(walk, model, poses, options, seed=seed, progress=progress)

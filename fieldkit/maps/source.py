@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError, SurfaceError
+from fieldkit.features import read_grey
 from fieldkit.frames import Pose
-from fieldkit.maps.headers import read_header
-from fieldkit.store import read_camera, read_rig, read_tum
+from fieldkit.maps.stamps import NamedPoses
+from fieldkit.store import calibration_file, read_camera, read_rig, read_tum
+from fieldkit.types import Image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".bmp")
 # Images with a SLAM pose that fix scale and frame of a map.
@@ -25,7 +27,8 @@ MIN_POSES = 3
 class SourceImage:
     """One mapping image: name below images/, file, camera, sequence (one camera's walk), frame, and SLAM pose.
 
-    ``rig_from_cam`` is known for a rig's images; those with the same ``frame`` were taken at the same time.
+    ``rig_from_cam`` is known for a rig's images; those with the same ``frame`` were taken at the same time. ``turns``
+    are the quarter turns, counter-clockwise, by which the file's picture is turned away from the camera's.
     """
 
     name: str
@@ -35,25 +38,30 @@ class SourceImage:
     frame: str
     slam_from_cam: Pose | None
     rig_from_cam: Pose | None = None
+    turns: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
 class DepthFrame:
-    """A depth image and the mapping images from whose poses its own follows: (index, cam_from_depth) each."""
+    """A depth image and the mapping images from whose poses its own follows: (index, cam_from_depth) each.
+
+    Where the file holds distances along the pixels' rays, ``ray_z`` f64[h, w] are the z of these unit rays.
+    """
 
     file: Path
     anchors: tuple[tuple[int, Pose], ...]
+    ray_z: NDArray[np.float64] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class MapSource:
-    """All mapping images (sorted by sequence and frame), the depth images if there are any, and the files it is of."""
+    """All mapping images (sorted by sequence and frame), the depth images if any, and what a user should know."""
 
     path: Path
     images: tuple[SourceImage, ...]
     depth_camera: Camera | None
     depth: tuple[DepthFrame, ...]
-    files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def n_posed(self) -> int:
@@ -61,11 +69,38 @@ class MapSource:
         return sum(image.slam_from_cam is not None for image in self.images)
 
 
+def without_poses(source: MapSource) -> MapSource:
+    """Return a source as if nothing had tracked its images."""
+    images = tuple(dataclasses.replace(image, slam_from_cam=None) for image in source.images)
+    return dataclasses.replace(source, images=images)
+
+
+def read_image(image: SourceImage) -> Image:
+    """Read a mapping image as its camera sees it, uint8[h, w]; raises FeatureError when it cannot be read."""
+    return np.ascontiguousarray(np.rot90(read_grey(image.file), -image.turns))
+
+
+def along_axis(depth_mm: NDArray[np.uint16], frame: DepthFrame) -> NDArray[np.uint16]:
+    """Return depth along the optical axis (mm) of what a depth image's file holds."""
+    return depth_mm if frame.ray_z is None else np.rint(depth_mm * frame.ray_z).astype(np.uint16)
+
+
+def read_depth(frame: DepthFrame, camera: Camera) -> NDArray[np.uint16]:
+    """Read a depth image, mm along the optical axis; raises SurfaceError when it is none of the camera's size."""
+    depth = cv2.imread(str(frame.file), cv2.IMREAD_UNCHANGED)
+    if depth is None or depth.dtype != np.uint16 or depth.shape != (camera.height, camera.width):
+        raise SurfaceError(
+            f"{frame.file}: expected a 16-bit PNG of {camera.width}x{camera.height} in mm",
+            hint="check the depth image and the depth camera's size",
+        )
+    return along_axis(np.asarray(depth, dtype=np.uint16), frame)
+
+
 def read_source(path: Path) -> MapSource:
     """Read a SOURCE folder: with rig.toml a rig's walk, else images/ and camera.toml; poses are optional.
 
-    The header of every image is read. Raises MapError when it is neither, when images or cameras are missing, when the
-    poses are of other images, and when an image cannot be read, has another size than its camera, or shares its name.
+    Raises MapError when it is neither, when images or cameras are missing, when the poses are of other images, and
+    when two images share a name.
     """
     path = Path(path)
     if not path.is_dir():
@@ -75,7 +110,7 @@ def read_source(path: Path) -> MapSource:
         )
     if not (path / "images").is_dir():
         raise MapError(f"{path}: no folder images/; expected it with the mapping images", hint="put them there")
-    source = _read_rig_folder(path) if (path / "rig.toml").is_file() else _read_image_folder(path)
+    source = _read_rig_folder(path) if calibration_file(path, "rig").is_file() else _read_image_folder(path)
     if not source.images:
         raise MapError(
             f"{path / 'images'}: no image found; expected files like {', '.join(IMAGE_SUFFIXES[:3])}",
@@ -88,52 +123,12 @@ def read_source(path: Path) -> MapSource:
             "which give the map its scale and gravity",
             hint="give each pose the name of its image file, without the folder",
         )
-    for image in source.images:
-        _refuse_unreadable(image.file, image.camera, bits=None)
-    for frame in source.depth:
-        assert source.depth_camera is not None
-        _refuse_unreadable(frame.file, source.depth_camera, bits=16)
-    texts = [path / name for name in ("rig.toml", "camera.toml", "depth_camera.toml")] + [poses_file]
-    files = [*(f for f in texts if f.is_file()), *(i.file for i in source.images), *(d.file for d in source.depth)]
-    return dataclasses.replace(source, files=tuple(files))
-
-
-def without_poses(source: MapSource) -> MapSource:
-    """Return a source as if nothing had tracked its images."""
-    images = tuple(dataclasses.replace(image, slam_from_cam=None) for image in source.images)
-    return dataclasses.replace(source, images=images)
-
-
-def read_depth(frame: DepthFrame, camera: Camera) -> NDArray[np.uint16]:
-    """Read a depth image (mm along the optical axis); raises SurfaceError when it is none of the camera's size."""
-    depth = cv2.imread(str(frame.file), cv2.IMREAD_UNCHANGED)
-    if depth is None or depth.dtype != np.uint16 or depth.shape != (camera.height, camera.width):
-        raise SurfaceError(
-            f"{frame.file}: expected a 16-bit PNG of {camera.width}x{camera.height} in mm",
-            hint="check the depth image and the depth camera's size",
-        )
-    return np.asarray(depth, dtype=np.uint16)
-
-
-def _refuse_unreadable(file: Path, camera: Camera, *, bits: int | None) -> None:
-    """Raise MapError when an image's header says that it cannot be used with its camera."""
-    found = read_header(file)
-    kind = "an image" if bits is None else f"a {bits}-bit depth image in mm"
-    expected = f"{kind} of {camera.width}x{camera.height} pixels as its camera says"
-    if isinstance(found, str):
-        raise MapError(f"{file}: {found}; expected {expected}", hint="replace or remove the file")
-    if (found.width, found.height) != (camera.width, camera.height):
-        raise MapError(
-            f"{file}: is {found.width}x{found.height}; expected {expected}",
-            hint="give every camera images of one size: it was calibrated for that one",
-        )
-    if bits is not None and found.bits != bits:
-        raise MapError(f"{file}: has {found.bits} bits; expected {expected}", hint="write depth as 16-bit PNG")
+    return source
 
 
 def poses_path(path: Path) -> Path:
     """Return where a SOURCE has its poses, if it has any."""
-    return path / ("slam_poses.txt" if (path / "rig.toml").is_file() else "poses.txt")
+    return path / ("slam_poses.txt" if calibration_file(path, "rig").is_file() else "poses.txt")
 
 
 def _image_files(folder: Path) -> list[Path]:
@@ -141,7 +136,7 @@ def _image_files(folder: Path) -> list[Path]:
 
 
 def _read_rig_folder(path: Path) -> MapSource:
-    rig = read_rig(path / "rig.toml")
+    rig = read_rig(calibration_file(path, "rig"))
     poses = _poses(poses_path(path))
     images: list[SourceImage] = []
     frames: dict[str, list[tuple[int, Pose]]] = {}
@@ -170,7 +165,7 @@ def _read_rig_folder(path: Path) -> MapSource:
 
 
 def _read_image_folder(path: Path) -> MapSource:
-    camera = read_camera(path / "camera.toml")
+    camera = read_camera(calibration_file(path, "camera"))
     poses = _poses(poses_path(path))
     images = []
     files = _image_files(path / "images")
@@ -203,13 +198,13 @@ def _refuse_duplicates(folder: Path, files: Sequence[Path]) -> None:
         seen[file.stem] = file.name
 
 
-def _poses(path: Path) -> dict[str, Pose]:
+def _poses(path: Path) -> NamedPoses:
     if not path.is_file():
-        return {}
+        return NamedPoses([])
     rows = read_tum(path)
     poses = dict(rows)
     if len(poses) < len(rows):
         names = [name for name, _ in rows]
         twice = next(name for name in names if names.count(name) > 1)
         raise MapError(f"{path}: {twice} has two poses; expected one per name", hint="take one of them out")
-    return poses
+    return NamedPoses(rows)

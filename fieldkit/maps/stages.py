@@ -59,6 +59,7 @@ class Stages:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 _remove(part)
                 write(part)
+                _flush(part)
                 os.replace(part, path)
         return path
 
@@ -122,7 +123,6 @@ def _read_arrays(path: Path) -> dict[str, NDArray[np.generic]] | None:
         with np.load(path, allow_pickle=False) as content:
             return {name: content[name] for name in content.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
-        # A machine that lost power may leave a file without its content
         path.unlink()
         return None
 
@@ -132,6 +132,13 @@ def _read_seconds(path: Path) -> dict[str, float]:
         return {str(k): float(v) for k, v in json.loads(path.read_text(encoding="utf-8")).items()}
     except (OSError, ValueError, AttributeError, TypeError):
         return {}
+
+
+def _flush(path: Path) -> None:
+    """Have the content on disk before the name: a machine that loses power would leave names without content."""
+    for file in (f for f in path.rglob("*") if f.is_file()) if path.is_dir() else [path]:
+        with file.open("rb") as stream:
+            os.fsync(stream.fileno())
 
 
 def _remove(path: Path) -> None:

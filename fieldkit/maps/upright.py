@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
-from fieldkit.features import read_grey
 from fieldkit.frames import Pose
 from fieldkit.maps.metric import depth_views
-from fieldkit.maps.source import MapSource, read_depth
+from fieldkit.maps.source import MapSource, read_depth, read_image
 
 Array = NDArray[np.float64]
 
@@ -147,7 +146,7 @@ def _line_normals(walk: MapSource, sfm_from_cam: Mapping[int, Pose]) -> _Normals
     normals, weights, blocks = [], [], []
     for k, i in enumerate(chosen):
         camera = walk.images[i].camera
-        ends = _lines(read_grey(walk.images[i].file), camera)
+        ends = _lines(read_image(walk.images[i]), camera)
         if not len(ends):
             continue
         a, b = (_unit(camera.unproject(ends[:, side])) for side in (0, 1))

@@ -28,7 +28,6 @@ from fieldkit.frames import Pose, exp
 from fieldkit.maps import MapOptions, build_map, load_map
 from fieldkit.maps.align import Alignment, umeyama
 from fieldkit.maps.framing import find_frame
-from fieldkit.maps.io import read_model
 from fieldkit.maps.source import MapSource, read_source, without_poses
 from fieldkit.store import read_tum, write_rig, write_tum
 from sim_bridge.mapping import mapper
@@ -101,7 +100,7 @@ def built(folder: Path, scene: str) -> Built:
     source, out = mapping(folder / f"{name}-{seed}" / "mapping", name, int(seed)), folder / f"{name}-{seed}" / "lab.map"
     if not (out / "map.toml").is_file():
         build_map(source, out)
-    walk, scene_map, model = read_source(source), load_map(out), read_model(out / "sparse")
+    walk, scene_map, model = read_source(source), load_map(out), pycolmap.Reconstruction(out / "sparse")
     model.transform(pycolmap.Sim3d(2.7, pycolmap.Rotation3d(UNKNOWN.as_quat()), np.array([3.0, -1.0, 7.0])))
     row = {image.name: i for i, image in enumerate(walk.images)}
     moved = {

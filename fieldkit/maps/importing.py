@@ -1,0 +1,250 @@
+"""`import_map`: a COLMAP or hloc model becomes a map folder: metric frame, landmarks, descriptors, surface."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from fieldkit.errors import MapError
+from fieldkit.features import Features, feature_kind
+from fieldkit.frames import Pose
+from fieldkit.maps.align import Alignment, Similarity, align_to_slam
+from fieldkit.maps.colmap import model_folder, read_model, write_model
+from fieldkit.maps.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
+from fieldkit.maps.io import (
+    AlignmentEntry,
+    MapFile,
+    SurfaceEntry,
+    content_digest,
+    positive,
+    write_features,
+    write_map_file,
+)
+from fieldkit.maps.landmarks import LandmarkRules, Model, good_landmarks
+from fieldkit.maps.meshes import ForeignMesh, fit_mesh
+from fieldkit.maps.options import MapReport
+from fieldkit.maps.stamps import match_names
+from fieldkit.store import atomic_folder, read_tum, refuse_existing
+from fieldkit.surface import write_ply
+from fieldkit.types import Surface
+
+Progress = Callable[[str, int, int], None]
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+_UP: dict[str, tuple[float, float, float]] = {
+    "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)
+}  # fmt: skip
+# Cameras are held upright on the whole: a median tilt beyond this means that another axis is up
+_MAX_TILT_DEG = 45.0
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportOptions:
+    """Where a model's scale, frame, descriptors and surface come from.
+
+    ``poses`` (TUM, z up, in m) are of its images; else ``scale`` makes its unit a metre, and ``up`` is its axis that
+    points up. ``features`` is hloc's features.h5, ``database`` COLMAP's; without either descriptors are extracted
+    from the images. Raises MapError when the scale is not positive or more than one source is given for one thing.
+    """
+
+    feature: str = "sift"
+    poses: Path | None = None
+    scale: float | None = None
+    up: Up = "z"
+    features: Path | None = None
+    database: Path | None = None
+    mesh: ForeignMesh | None = None
+    landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
+
+    def __post_init__(self) -> None:
+        if self.scale is not None:
+            positive("scale", self.scale)
+        for first, second in (("poses", "scale"), ("features", "database")):
+            if getattr(self, first) is not None and getattr(self, second) is not None:
+                raise MapError(f"--{first} and --{second} are both given; expected one", hint="leave one of them away")
+
+
+def import_map(
+    model_path: Path,
+    out: Path,
+    *,
+    images: Path | None = None,
+    options: ImportOptions | None = None,
+    force: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> MapReport:
+    """Make a map folder of a COLMAP model (binary or text, any version; also as hloc leaves it in ``sfm/``).
+
+    Keypoints that observe no landmark are left out. ``images`` is needed where descriptors are extracted. Raises
+    MapError when the model, its descriptors, images, poses or mesh cannot be used, or its scale is unknown, and
+    StoreError when ``out`` is in the way; nothing is left behind.
+    """
+    options = ImportOptions() if options is None else options
+    tell: Progress = progress or (lambda step, done, total: None)
+    feature_kind(options.feature)
+    refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
+    seconds, start = {}, time.perf_counter()
+    folder = model_folder(model_path)
+    found = read_model(folder)
+    _refuse_useless(folder, found, images, options)
+    alignment, warnings = metric_alignment(folder, found, options, seed=seed)
+    model, n_points = _in_map(found, alignment.map_from_sfm), len(found.xyz)
+    good = good_landmarks(model, options.landmarks)
+    if not good.any():
+        rules = options.landmarks
+        raise MapError(
+            f"{folder}: none of {n_points} points is seen by {rules.min_images} images from "
+            f"{rules.min_distance_m:g}..{rules.max_distance_m:g} m",
+            hint="check the scale: --scale is metres per unit of the model",
+        )
+    model = keep_landmarks(model, good)
+    seconds["read"], start = time.perf_counter() - start, time.perf_counter()
+    descriptors = _descriptors(model, images, options, tell)
+    warnings += _described(model, descriptors)
+    seconds["describe"], start = time.perf_counter() - start, time.perf_counter()
+    surface, doubts = (None, []) if options.mesh is None else fit_mesh(options.mesh, model)
+    warnings += doubts if surface is not None else ["no mesh: the map has no surface, and occlusion cannot be computed"]
+    seconds["surface"], start = time.perf_counter() - start, time.perf_counter()
+    counts = len(found.image_names), len(model.image_names), len(model.xyz)
+    with atomic_folder(Path(out), force=force, marker="map.toml") as work:
+        write_landmark_map(work, model, descriptors, surface)
+        digest = content_digest(work)
+        write_map_file(work, MapFile(1, digest, options.feature, *counts, _entry(alignment), _surface_entry(surface)))
+    seconds["write"] = time.perf_counter() - start
+    return MapReport(str(out), digest, *counts, alignment, surface is not None, seconds, tuple(warnings))
+
+
+def _refuse_useless(folder: Path, model: Model, images: Path | None, options: ImportOptions) -> None:
+    if not model.image_names or not len(model.xyz) or not len(model.observation_landmark):
+        raise MapError(
+            f"{folder}: {len(model.image_names)} registered images, {len(model.xyz)} points; expected both",
+            hint="a model without points can be triangulated first: `colmap point_triangulator`",
+        )
+    if len(set(model.image_names)) < len(model.image_names):
+        twice = next(n for n in model.image_names if model.image_names.count(n) > 1)
+        raise MapError(f"{folder}: two images are called {twice}; expected one", hint="rename one of them")
+    if images is not None:
+        refuse_missing(images, model)
+    elif options.features is None and options.database is None:
+        raise MapError(
+            f"{folder}: a model has no descriptors; expected the images to extract them from, or the features",
+            hint="give --images DIR, or --features features.h5 of hloc, or --database database.db of COLMAP",
+        )
+
+
+def metric_alignment(folder: Path, model: Model, options: ImportOptions, *, seed: int) -> tuple[Alignment, list[str]]:
+    """Return map_from_sfm, by poses of the model's images or as the user states it, and what a user should know.
+
+    Raises MapError when neither is given, or the poses do not fit.
+    """
+    if options.poses is not None:
+        poses = match_names(read_tum(options.poses), model.image_names)
+        posed = [i for i, name in enumerate(model.image_names) if name in poses]
+        try:
+            alignment = align_to_slam(
+                [model.map_from_image[i] for i in posed], [poses[model.image_names[i]] for i in posed], seed=seed
+            )
+        except MapError as error:
+            raise MapError(f"{options.poses}: {error.message}", hint=error.hint) from error
+        if alignment.verdict == "pass":
+            return alignment, []
+        return alignment, [
+            f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} poses within "
+            f"{alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
+        ]
+    if options.scale is None:
+        raise MapError(
+            f"{folder}: its scale is unknown; expected what makes it metric and z up",
+            hint="give --poses poses.txt (TUM, of its images), or --scale 1 --up z when it is in metres with z up",
+        )
+    return _known(model, options.scale, options.up)
+
+
+def _known(model: Model, scale: float, up: Up) -> tuple[Alignment, list[str]]:
+    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [_UP[up]])
+    similarity = Similarity(scale, turn, np.zeros(3))
+    ups = np.stack([(turn * p.rotation).apply([0.0, -1.0, 0.0]) for p in model.map_from_image])
+    tilt_deg = float(np.degrees(np.arccos(np.clip(np.median(ups[:, 2]), -1.0, 1.0))))
+    verdict: Literal["pass", "warn"] = "pass" if tilt_deg < _MAX_TILT_DEG else "warn"
+    doubts = [] if verdict == "pass" else [f"the cameras' up is {tilt_deg:.0f} deg off the map's: check --up"]
+    return Alignment(similarity, "known", 0, 0, 0.0, 0.0, 0.0, 0.0, verdict), doubts
+
+
+def _in_map(model: Model, map_from_sfm: Similarity) -> Model:
+    poses: tuple[Pose, ...] = tuple(map_from_sfm.pose(p) for p in model.map_from_image)
+    return dataclasses.replace(model, xyz=map_from_sfm.points(model.xyz), map_from_image=poses)
+
+
+def keep_landmarks(model: Model, kept: NDArray[np.bool_]) -> Model:
+    """Return a model with the points bool[n] only, numbered anew from 1, and only the keypoints that observe them.
+
+    ``observation_keypoint`` still counts the original keypoints.
+    """
+    number = np.cumsum(kept) - 1
+    rows = kept[model.observation_landmark]
+    return dataclasses.replace(
+        model,
+        xyz=model.xyz[kept],
+        point_ids=np.arange(1, int(kept.sum()) + 1),
+        observation_landmark=number[model.observation_landmark[rows]].astype(np.int32),
+        observation_image=model.observation_image[rows],
+        observation_keypoint=model.observation_keypoint[rows],
+        observation_px=model.observation_px[rows],
+    )
+
+
+def _descriptors(model: Model, images: Path | None, options: ImportOptions, tell: Progress) -> NDArray[Any]:
+    if options.features is not None:
+        return hloc_descriptors(options.features, model, feature=options.feature)
+    if options.database is not None:
+        return database_descriptors(options.database, model, feature=options.feature)
+    assert images is not None
+    return image_descriptors(images, model, feature=options.feature, progress=tell)
+
+
+def _described(model: Model, descriptors: NDArray[Any]) -> list[str]:
+    """Say how many landmarks have a descriptor; raises MapError when hardly any has."""
+    filled = descriptors.any(axis=1)
+    share = len(np.unique(model.observation_landmark[filled])) / len(model.xyz)
+    if share < 0.1:
+        raise MapError(
+            f"{100 * share:.0f} % of {len(model.xyz)} landmarks have keypoints of the feature within a pixel; expected "
+            "a model that was made with this feature",
+            hint="give --feature with the model's own, or --features or --database",
+        )
+    return [] if share > 0.9 else [f"{100 * share:.0f} % of the landmarks have a descriptor; the others match nothing"]
+
+
+def write_landmark_map(folder: Path, model: Model, descriptors: NDArray[Any], surface: Surface | None) -> None:
+    """Write sparse/, features.h5 and surface.ply with the keypoints that observe landmarks; no map.toml."""
+    bounds = np.searchsorted(model.observation_image, np.arange(len(model.image_names) + 1))
+    parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
+    pixels = [model.observation_px[part] for part in parts]
+    keypoint = np.concatenate([np.arange(len(p), dtype=np.int32) for p in pixels])
+    write_model(folder / "sparse", dataclasses.replace(model, observation_keypoint=keypoint), pixels)
+    features = {}
+    for name, part in zip(model.image_names, parts, strict=True):
+        ones = np.ones(part.stop - part.start, dtype=np.float32)
+        features[name] = Features(model.observation_px[part], ones, ones, descriptors[part])
+    sizes = {n: (c.width, c.height) for n, c in zip(model.image_names, model.image_cameras, strict=True)}
+    write_features(folder / "features.h5", features, sizes)
+    if surface is not None:
+        write_ply(folder / "surface.ply", surface)
+
+
+def _entry(a: Alignment) -> AlignmentEntry:
+    return AlignmentEntry(
+        a.source, a.map_from_sfm.scale, a.n_used, a.n_total, a.rms_m, a.p95_m, a.gravity_deg, a.verdict
+    )
+
+
+def _surface_entry(surface: Surface | None) -> SurfaceEntry | None:
+    return None if surface is None else SurfaceEntry(surface.voxel_m, surface.voxel_m, "surface.ply")
