@@ -10,10 +10,12 @@ from synthetic_map import CAMERA, looking
 
 from fieldkit.features import Features
 from fieldkit.frames import Pose, exp
-from fieldkit.maps.build import MapOptions, _Matched, _place, _unfolded
+from fieldkit.maps.options import MapOptions
+from fieldkit.maps.placing import Matched, place_once, unfolded
 from fieldkit.maps.plausible import SlamRules, plausible_pairs
 from fieldkit.maps.sfm import relative_poses
 from fieldkit.maps.source import MapSource, SourceImage
+from fieldkit.maps.stages import Stages
 from fieldkit.maps.strays import contradicting
 
 PLACES = [looking(np.array([x, 0.0, 1.5]), np.pi / 2) for x in (0.0, 1.0)]
@@ -72,7 +74,7 @@ def test_an_image_contradicts_where_it_is_farther_from_slam_than_drift_goes() ->
     assert contradicting(images, mapped, threshold_m=1.1) == set()
 
 
-def two_rooms(rng: np.random.Generator) -> _Matched:
+def two_rooms(rng: np.random.Generator) -> Matched:
     """Return a walk past two identical rooms 6 m apart with little between them, with the matches of both kinds."""
     room = rng.uniform([-0.8, 2.2, 0.6], [0.8, 3.4, 2.4], (150, 3))
     wall = rng.uniform([0.5, 2.6, 0.6], [5.5, 3.2, 2.4], (70, 3))
@@ -95,13 +97,18 @@ def two_rooms(rng: np.random.Generator) -> _Matched:
         common = [(n, other[int(i)]) for n, i in enumerate(ids[a]) if int(i) in other and (twin or b - a < 5)]
         pairs.append((a, b))
         matches.append(np.array(common, np.uint32).reshape(-1, 2))
-    return _Matched(MapSource(Path("two rooms"), tuple(images), None, ()), seen, pairs, matches)
+    return Matched(MapSource(Path("two rooms"), tuple(images), None, ()), seen, pairs, matches)
 
 
-def test_a_map_in_which_one_room_lies_on_the_next_is_unfolded(rng: np.random.Generator) -> None:
-    found, options = two_rooms(rng), MapOptions(n_threads=1)
-    folded = _place(found, options, 0, lambda step, done, total: None)
+def test_a_map_in_which_one_room_lies_on_the_next_is_unfolded(tmp_path: Path, rng: np.random.Generator) -> None:
+    found, options, stages = two_rooms(rng), MapOptions(n_threads=1), Stages(tmp_path, {})
+    folded = place_once(found, stages, options, seed=0, progress=quiet)
     assert folded.contradicting > 0.05 * len(folded.sfm_poses)
-    again = _place(_unfolded(found, SlamRules(), options, 0), options, 0, lambda step, done, total: None)
+    less = unfolded(found, SlamRules(), stages, options, seed=0, progress=quiet)
+    again = place_once(less, stages, options, seed=0, progress=quiet, name="unfolded")
     assert again.contradicting == 0
     assert len(again.sfm_poses) == len(found.walk.images)
+
+
+def quiet(step: str, done: int, total: int) -> None:
+    pass

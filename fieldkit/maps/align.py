@@ -16,6 +16,8 @@ from fieldkit.maps.source import MIN_POSES
 
 Array = NDArray[np.float64]
 Verdict = Literal["pass", "warn", "fail"]
+AlignmentSource = Literal["slam", "tags", "depth", "known"]
+GravityFrom = Literal["slam", "floor", "verticals", "cameras", "known"]
 
 # Below this no camera is called an outlier, however well the others fit: SLAM and SfM both are that uncertain.
 _MIN_THRESHOLD_M = 0.05
@@ -52,10 +54,14 @@ class Alignment:
     Residuals are distances between aligned and SLAM camera centres: ``rms_m`` of those used, ``p95_m`` of all.
     ``gravity_deg`` is the median angle between the up directions of aligned and SLAM cameras, after levelling.
     ``threshold_m`` is the residual above which a SLAM position was left out; it is chosen from the drift.
+    Without SLAM positions what is counted, and the residuals, are those of ``source``: tags' corners or depths at
+    landmarks, in m; ``gravity_deg`` is the standard deviation of the direction that ``gravity_from`` tells of.
+    ``scale_sigma`` is the relative standard deviation of the scale, ``reprojection_px`` the root mean square residual
+    in the images of poses that were given.
     """
 
     map_from_sfm: Similarity
-    source: Literal["slam", "tags", "depth", "known"]
+    source: AlignmentSource
     n_used: int
     n_total: int
     rms_m: float
@@ -63,6 +69,9 @@ class Alignment:
     gravity_deg: float
     threshold_m: float
     verdict: Verdict
+    gravity_from: GravityFrom = "slam"
+    scale_sigma: float | None = None
+    reprojection_px: float | None = None
 
 
 def umeyama(source: Array, target: Array) -> Similarity:

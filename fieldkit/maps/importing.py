@@ -17,7 +17,6 @@ from fieldkit.errors import MapError
 from fieldkit.features import Features, feature_kind
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, align_to_slam
-from fieldkit.maps.build import MapReport
 from fieldkit.maps.colmap import model_folder, read_model, write_model
 from fieldkit.maps.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
 from fieldkit.maps.io import (
@@ -31,6 +30,7 @@ from fieldkit.maps.io import (
 )
 from fieldkit.maps.landmarks import LandmarkRules, Model, good_landmarks
 from fieldkit.maps.meshes import ForeignMesh, fit_mesh
+from fieldkit.maps.options import MapReport
 from fieldkit.maps.stamps import match_names
 from fieldkit.store import atomic_folder, read_tum, refuse_existing
 from fieldkit.surface import write_ply

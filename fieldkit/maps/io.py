@@ -16,6 +16,7 @@ from fieldkit.features import FEATURES, Features
 from fieldkit.maps.colmap import read_model
 from fieldkit.maps.descriptors import read_landmark_descriptors
 from fieldkit.maps.landmarks import landmark_covariance
+from fieldkit.maps.record import read_record
 from fieldkit.store import digest, read_toml, write_toml
 from fieldkit.surface import read_ply
 from fieldkit.types import SceneMap, Surface
@@ -34,6 +35,9 @@ class AlignmentEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     p95_m: float
     gravity_deg: float
     verdict: Literal["pass", "warn", "fail"]
+    scale_sigma: float | None = None
+    gravity_from: Literal["slam", "floor", "verticals", "cameras", "known"] | None = None
+    reprojection_px: float | None = None
 
 
 class SurfaceEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -190,8 +194,10 @@ def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
 
 
 def map_info(path: Path) -> dict[str, Any]:
-    """Return what map.toml says of a map, as plain values, with its path."""
-    return {"path": str(path), **msgspec.to_builtins(read_map_file(path))}
+    """Return what map.toml says of a map, as plain values, with its path, and how it was built where that is kept."""
+    entry, record = read_map_file(path), read_record(Path(path))
+    built = {} if record is None else {"seconds": record.seconds, "versions": record.versions}
+    return {"path": str(path), **msgspec.to_builtins(entry), **built}
 
 
 def write_map_file(path: Path, entry: MapFile) -> None:
