@@ -29,8 +29,11 @@ SEEN_BY = np.arange(4, 8)
 QUERY_SEED = 7
 
 LOAD = """
-import json, resource, sys, time
-def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+import json, sys, time
+def peak():
+    # Not ru_maxrss, which a child inherits from the process that started it
+    lines = open("/proc/self/status").read().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
 import cv2, numpy, pycolmap, pathlib
 from fieldkit.maps import load_map
 from fieldkit.localize import Localizer
