@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,7 @@ from fieldkit.features.matchers import PairMatcher, open_matcher
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity
 from fieldkit.maps.checking import check_images, content
-from fieldkit.maps.framing import refuse_unscaled
+from fieldkit.maps.framing import look_for_tags, refuse_unscaled
 from fieldkit.maps.io import (
     AlignmentEntry,
     MapFile,
@@ -83,11 +84,13 @@ def build_map(
     versions = library_versions()
     key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
     with resumed(out, key) as stages:
+        with stages.timed("tags"):
+            tags = look_for_tags(walk, options, progress=tell)
         with stages.timed("extract"):
             features = _extract_all(walk, extractor, stages, options, tell)
         with stages.timed("match"):
             found = _match_all(walk, features, matcher, stages, options, seed, tell)
-        placing = place_images(found, stages, options, seed=seed, progress=tell)
+        placing = place_images(dataclasses.replace(found, tags=tags), stages, options, seed=seed, progress=tell)
         with stages.timed("align"):
             model, alignment = placing.model, placing.alignment
             mapped, left_out = _placed(walk, model, placing.sfm_poses, alignment)
@@ -187,8 +190,8 @@ def _plausible(found: Matched, options: MapOptions) -> Matched:
     share = sum(map(len, plausible)) / max(sum(map(len, found.matches)), 1)
     if share < options.slam.least_share:
         told = f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"
-        return Matched(found.walk, found.features, found.pairs, found.matches, (told,))
-    return Matched(found.walk, found.features, found.pairs, plausible)
+        return dataclasses.replace(found, disbelieved=(told,))
+    return dataclasses.replace(found, matches=plausible)
 
 
 def _placed(

@@ -25,6 +25,7 @@ from fieldkit.maps.sfm import quiet_colmap, reconstruct, relative_poses, threads
 from fieldkit.maps.source import MapSource
 from fieldkit.maps.stages import Stages
 from fieldkit.maps.strays import contradicting
+from fieldkit.tags import TagDetection
 
 # A few misplaced images are left out; of more than this share the rest is bent too, and SfM starts again.
 _FOLDED = 0.05
@@ -33,13 +34,17 @@ _NAMES = 4
 
 @dataclasses.dataclass(frozen=True)
 class Matched:
-    """What SfM starts from; ``disbelieved`` says why SLAM's poses ruled out nothing, if they did not."""
+    """What SfM starts from, and the tags that images show.
+
+    ``disbelieved`` says why SLAM's poses ruled out nothing, if they did not.
+    """
 
     walk: MapSource
     features: Sequence[Features]
     pairs: Sequence[Pair]
     matches: Sequence[NDArray[np.uint32]]
     disbelieved: tuple[str, ...] = ()
+    tags: Mapping[int, Sequence[TagDetection]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +109,7 @@ def place_once(
             model = pycolmap.Reconstruction(folder / "0")
         poses, pieces = _registered(walk, model, folder, options)
     with stages.timed("align"):
-        alignment, warnings = find_frame(walk, model, poses, options, seed=seed, progress=progress)
+        alignment, warnings = find_frame(walk, model, poses, options, tags=found.tags, seed=seed)
         mapped = {i: alignment.map_from_sfm.pose(p) for i, p in poses.items()}
         far = contradicting(walk.images, mapped, threshold_m=alignment.threshold_m)
     return Placing(model, poses, alignment, (*pieces, *warnings), len(far))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,9 @@ from fieldkit.maps import MapOptions, build_map, load_map
 from fieldkit.maps.align import Alignment, umeyama
 from fieldkit.maps.framing import find_frame
 from fieldkit.maps.source import MapSource, read_source, without_poses
+from fieldkit.maps.tagged import find_tags
 from fieldkit.store import read_tum, write_rig, write_tum
+from fieldkit.tags import TagDetection
 from sim_bridge.mapping import mapper
 from sim_bridge.scenes import make_blueprint
 from sim_bridge.scenes.changes import STANDARD_CHANGES, make_worlds
@@ -74,16 +76,18 @@ def write(path: Path, data: bytes) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Built:
-    """A source, its model in an unknown frame, the images' poses there, and the true ones."""
+    """A source, its model in an unknown frame, the images' poses there and the true ones, and the tags they show."""
 
     walk: MapSource
     model: pycolmap.Reconstruction
     poses: Mapping[int, Pose]
     true: Mapping[int, Pose]
+    tags: Mapping[int, Sequence[TagDetection]]
 
     def aligned(self, walk: MapSource, options: MapOptions) -> Alignment:
         """Align the model anew."""
-        return find_frame(walk, self.model, self.poses, options, seed=0, progress=lambda step, done, total: None)[0]
+        tags = self.tags if options.tag_sizes_m else {}
+        return find_frame(walk, self.model, self.poses, options, tags=tags, seed=0)[0]
 
     def errors(self, alignment: Alignment) -> tuple[float, float]:
         """Return the relative error of the scale, and the angle between the map's z axis and the true one (deg)."""
@@ -108,7 +112,8 @@ def built(folder: Path, scene: str) -> Built:
         for name, p in zip(scene_map.image_names, scene_map.map_from_image, strict=True)
     }
     true = {row[name]: pose for name, pose in read_tum(source / "truth.txt") if name in row}
-    return Built(walk, model, dict(sorted(moved.items())), true)
+    tags = find_tags(walk, {None: SIZE_M}, ("tag36h11",), progress=lambda done: None)
+    return Built(walk, model, dict(sorted(moved.items())), true, tags)
 
 
 def wrong(walk: MapSource, *, block: bool, rng: np.random.Generator) -> MapSource:
