@@ -56,8 +56,8 @@ class Alignment:
     ``threshold_m`` is the residual above which a SLAM position was left out; it is chosen from the drift.
     Without SLAM positions what is counted, and the residuals, are those of ``source``: tags' corners or depths at
     landmarks, in m; ``gravity_deg`` is the standard deviation of the direction that ``gravity_from`` tells of.
-    ``scale_sigma`` is the relative standard deviation of the scale, ``reprojection_px`` the root mean square residual
-    in the images of poses that were given.
+    ``scale_sigma`` is the relative standard deviation of the scale. Of poses that were given, ``reprojection_px`` is
+    the root mean square residual in the images, and ``match_share`` how much of the matches they fit.
     """
 
     map_from_sfm: Similarity
@@ -72,6 +72,7 @@ class Alignment:
     gravity_from: GravityFrom = "slam"
     scale_sigma: float | None = None
     reprojection_px: float | None = None
+    match_share: float | None = None
 
 
 def umeyama(source: Array, target: Array) -> Similarity:

@@ -293,6 +293,7 @@ def _alignment_entry(a: Alignment) -> AlignmentEntry:
         scale_sigma=a.scale_sigma,
         gravity_from=a.gravity_from,
         reprojection_px=a.reprojection_px,
+        match_share=a.match_share,
     )
 
 

@@ -61,15 +61,16 @@ def find_frame(
     *,
     tags: Mapping[int, Sequence[TagDetection]],
     seed: int,
+    match_share: float = 1.0,
 ) -> Told:
     """Return map_from_sfm with its residuals and verdict, and what a user should know about it.
 
     With SLAM's poses the frame is theirs, and tags or depth may refine the scale; without, the first camera is the
-    origin, looks along x, and up is told by the images. ``tags`` are those that `look_for_tags` found. Raises MapError
-    when what is asked for cannot be found.
+    origin, looks along x, and up is told by the images. ``tags`` are those that `look_for_tags` found;
+    ``match_share`` says how well poses that are known fit. Raises MapError when what is asked for cannot be found.
     """
     if options.poses == "known":
-        return _by_known(walk, model, sfm_poses)
+        return _by_known(walk, model, sfm_poses, match_share)
     posed = {i: p for i in sfm_poses if (p := walk.images[i].slam_from_cam) is not None}
     sightings = [(pose, walk.images[i].camera, d) for i, pose in sfm_poses.items() for d in tags.get(i, ())]
     scale = tag_scale(sightings, options.tag_sizes_m, seed=seed)
@@ -211,15 +212,15 @@ def _gravity_told(up: Upright) -> str:
     return f"nothing measured gravity: up is known to {up.sigma_deg:.2f} deg if {assumed}"
 
 
-def _by_known(walk: MapSource, model: pycolmap.Reconstruction, poses: Mapping[int, Pose]) -> Told:
+def _by_known(walk: MapSource, model: pycolmap.Reconstruction, poses: Mapping[int, Pose], share: float) -> Told:
     up = find_upright(walk, poses)
     tilt = float(np.degrees(np.arccos(np.clip(up.up_in_sfm[2], -1.0, 1.0))))
-    alignment = known_alignment(model, poses, (tilt, up.sigma_deg))
+    alignment = known_alignment(model, poses, share=share, tilt=(tilt, up.sigma_deg))
     told = []
     if alignment.verdict != "pass":
         told.append(
-            f"known poses, verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} images fit, rms "
-            f"{alignment.reprojection_px:.2f} px, up {tilt:.1f} +- {up.sigma_deg:.1f} deg from z as the images show it"
+            f"known poses, verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} images see points, "
+            f"{100 * share:.0f} % of the matches fit, up is {tilt:.1f} +- {up.sigma_deg:.1f} deg off z in the images"
         )
     found = _depth_ratio(walk, model, poses, alignment.map_from_sfm)
     if found is not None and abs(found.ratio - 1.0) > max(0.02, 4.0 * found.sigma):

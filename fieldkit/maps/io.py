@@ -38,6 +38,7 @@ class AlignmentEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scale_sigma: float | None = None
     gravity_from: Literal["slam", "floor", "verticals", "cameras", "known"] | None = None
     reprojection_px: float | None = None
+    match_share: float | None = None
 
 
 class SurfaceEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
