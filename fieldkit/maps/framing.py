@@ -17,6 +17,7 @@ from fieldkit.maps.known import known_alignment
 from fieldkit.maps.landmarks import model_arrays
 from fieldkit.maps.metric import DepthScale, depth_scale, rescaled, with_depth_scale
 from fieldkit.maps.options import MapOptions, Progress
+from fieldkit.maps.order import walk_order
 from fieldkit.maps.source import MIN_POSES, MapSource, poses_path, read_depth
 from fieldkit.maps.tagged import MIN_IMAGES, TagScale, find_tags, tag_scale
 from fieldkit.maps.upright import Upright, find_upright, up_rotation
@@ -80,7 +81,9 @@ def find_frame(
     if walk.n_posed < MIN_POSES:
         return _by_images(walk, model, sfm_poses, scale, told)
     try:
-        alignment = align_to_slam([sfm_poses[i] for i in posed], list(posed.values()), seed=seed)
+        alignment = align_to_slam(
+            [sfm_poses[i] for i in posed], list(posed.values()), seed=seed, walks=_walks(walk, list(posed))
+        )
     except MapError as error:
         raise MapError(f"{walk.path}: {error.message}", hint=error.hint) from error
     told += _doubts(alignment)
@@ -98,6 +101,15 @@ def find_frame(
         alignment, found, sfm_centres=centres[0], slam_centres=centres[1], anyway=options.scale == "depth"
     )
     return scaled, told + doubts
+
+
+def _walks(walk: MapSource, posed: Sequence[int]) -> list[list[int]]:
+    """Return, for each sequence, the rows of ``posed`` of its images in the order in which they were taken."""
+    row = {i: k for k, i in enumerate(posed)}
+    sequences: dict[str, list[int]] = {}
+    for i in posed:
+        sequences.setdefault(walk.images[i].sequence, []).append(i)
+    return [[row[i] for i in walk_order(walk.images, members)] for members in sequences.values()]
 
 
 def _doubts(alignment: Alignment) -> list[str]:
