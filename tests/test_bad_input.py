@@ -167,6 +167,8 @@ def test_an_unknown_feature(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_an_unknown_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from test_store import make_run
 
+    from fieldkit import store
+
     store.write_run(tmp_path / "run", make_run())
     assert "unknown preset 'lamer'; did you mean 'lamar'" in fails(
         capsys, "score", tmp_path / "run", "--preset", "lamer"

@@ -206,7 +206,7 @@ def whole(folder: Path, scene: str) -> str:
         gravity = np.degrees(np.arccos(min(up[2], 1.0)))
         lines.append(
             f"{scene} | 30 % wrong, {kind} | {100 * gauge.scale_error:+.3f} | {gravity:.3f} | "
-            f"{1000 * gauge.rms_m:.1f} | {len(scene_map.image_names)} | {(copy / 'told.txt').read_text(encoding='utf-8')}"
+            f"{1000 * gauge.rms_m:.1f} | {len(scene_map.image_names)} | {(copy / 'told.txt').read_text()}"
         )
     return "\n".join(lines)
 
