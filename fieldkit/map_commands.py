@@ -21,23 +21,44 @@ def map_build(
     *,
     out: Path,
     feature: str = "sift",
-    scale: Literal["auto", "slam"] = "auto",
+    matcher: Literal["nearest", "lightglue"] = "nearest",
+    weights: Path | None = None,
+    poses: Literal["slam", "known", "none"] = "slam",
+    scale: Literal["auto", "slam", "tags", "depth"] = "auto",
+    size_m: Repeated[tuple[str, ...]] = (),
+    family: Repeated[tuple[str, ...]] = (),
     voxel_m: float = 0.04,
     force: bool = False,
 ) -> None:
-    """Build a metric map: SfM landmarks from the images, frame and scale from SLAM poses, surface from depth.
+    """Build a metric map: SfM landmarks from the images; scale and frame from SLAM poses, tags or depth; a surface.
+
+    A build that was interrupted goes on when the same command is given again.
 
     Args:
         source: mapping folder (rig.toml) or image folder (images/, camera.toml, poses.txt, depth/)
         out: map folder to write
-        feature: local feature of landmarks
-        scale: auto refines the SLAM poses' scale by calibrated depth images; slam does not
+        feature: local feature of landmarks: sift, sift_l2, akaze, aliked, xfeat, superpoint
+        matcher: how pairs of mapping images are matched: nearest neighbours, or lightglue (aliked only, slow)
+        weights: folder where the weights of networks are looked for first
+        poses: slam gives scale, frame and gravity; known takes the poses as they are; none does not read them
+        scale: from what; auto takes tags where --size-m is given, else calibrated depth images, else SLAM
+        size_m: edge in m of the black square of AprilTags in the mapping images, or ID:SIZE; may be repeated
+        family: tag family, by default tag36h11; may be repeated
         voxel_m: edge length of a voxel of the surface
         force: replace an existing map
     """
     from fieldkit import maps
+    from fieldkit.calibrate import parse_sizes
 
-    options = maps.MapOptions(scale=scale, voxel_m=voxel_m)
+    options = maps.MapOptions(
+        matcher=matcher,
+        weights=weights,
+        poses=poses,
+        scale=scale,
+        tag_sizes_m=parse_sizes(size_m) if size_m else {},
+        tag_families=family or ("tag36h11",),
+        voxel_m=voxel_m,
+    )
     with ProgressBars() as progress:
         built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
     for warning in built.warnings:

@@ -14,10 +14,13 @@ Ints = NDArray[np.int32]
 _BLOCK = 256
 
 
-def match_pair(first: Descriptors, second: Descriptors, *, ratio: float) -> NDArray[np.uint32]:
+def match_pair(
+    first: Descriptors, second: Descriptors, *, ratio: float, min_cosine: float = -1.0
+) -> NDArray[np.uint32]:
     """Match descriptors (n, w) and (m, w): mutual nearest neighbours that pass the distance ratio in both images.
 
-    Returns uint32[k, 2] of indices, sorted by the first. A ratio of 1 switches that test off.
+    Returns uint32[k, 2] of indices, sorted by the first. A ratio of 1 switches that test off; ``min_cosine`` is the
+    least similarity of unit descriptors.
     """
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), dtype=np.uint32)
@@ -29,6 +32,8 @@ def match_pair(first: Descriptors, second: Descriptors, *, ratio: float) -> NDAr
     forward, forward_ok, backward, backward_ok = found
     rows = np.arange(len(first))
     kept = (backward[forward] == rows) & forward_ok & backward_ok[forward]
+    if min_cosine > -1.0:
+        kept[kept] = np.einsum("ij,ij->i", first[kept], second[forward[kept]]) >= np.float32(min_cosine)
     return np.column_stack([rows[kept], forward[kept]]).astype(np.uint32)
 
 

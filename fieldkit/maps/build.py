@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -14,11 +15,12 @@ import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, extract, feature_kind
+from fieldkit.features import Extractor, Features, feature_name, open_extractor
+from fieldkit.features.matchers import PairMatcher, open_matcher
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity
 from fieldkit.maps.checking import check_images, content
-from fieldkit.maps.framing import refuse_unscaled
+from fieldkit.maps.framing import look_for_tags, refuse_unscaled
 from fieldkit.maps.io import (
     AlignmentEntry,
     MapFile,
@@ -69,20 +71,26 @@ def build_map(
     """
     options, out = MapOptions() if options is None else options, Path(out)
     tell: Progress = progress or (lambda step, done, total: None)
-    feature_kind(feature)
+    feature = feature_name(feature)
     refuse_existing(out, force=force, marker="map.toml", kind="folder")
     walk = open_source(Path(source))
     refuse_unscaled(walk, options)
     check_images(walk)
+    extractor = open_extractor(
+        feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
+    )
+    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
     walk = without_poses(walk) if options.poses == "none" else walk
     versions = library_versions()
     key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
     with resumed(out, key) as stages:
+        with stages.timed("tags"):
+            tags = look_for_tags(walk, options, progress=tell)
         with stages.timed("extract"):
-            features = _extract_all(walk, feature, stages, options, tell)
+            features = _extract_all(walk, extractor, stages, options, tell)
         with stages.timed("match"):
-            found = _match_all(walk, features, stages, options, seed, tell)
-        placing = place_images(found, stages, options, seed=seed, progress=tell)
+            found = _match_all(walk, features, matcher, stages, options, seed, tell)
+        placing = place_images(dataclasses.replace(found, tags=tags), stages, options, seed=seed, progress=tell)
         with stages.timed("align"):
             model, alignment = placing.model, placing.alignment
             mapped, left_out = _placed(walk, model, placing.sfm_poses, alignment)
@@ -101,14 +109,11 @@ def build_map(
     return MapReport(str(out), made, *counts, alignment, surface is not None, dict(stages.seconds), told)
 
 
-def _extract_all(walk: MapSource, feature: str, stages: Stages, options: MapOptions, tell: Progress) -> list[Features]:
+def _extract_all(
+    walk: MapSource, extractor: Extractor, stages: Stages, options: MapOptions, tell: Progress
+) -> list[Features]:
     def make(image: SourceImage) -> dict[str, NDArray[np.generic]]:
-        found = extract(
-            read_image(image),
-            feature=feature,
-            max_keypoints=options.max_keypoints,
-            max_side_px=options.max_image_size,
-        )
+        found = extractor.extract(read_image(image, colour=extractor.kind.colour))
         return {
             "keypoints": found.keypoints_px,
             "scores": found.scores,
@@ -130,17 +135,21 @@ def _extract_all(walk: MapSource, feature: str, stages: Stages, options: MapOpti
 
 
 def _match_all(
-    walk: MapSource, features: list[Features], stages: Stages, options: MapOptions, seed: int, tell: Progress
+    walk: MapSource,
+    features: list[Features],
+    matcher: PairMatcher,
+    stages: Stages,
+    options: MapOptions,
+    seed: int,
+    tell: Progress,
 ) -> Matched:
     """Match the chosen pairs of images and keep what SLAM's poses allow; say so where SLAM is not believed."""
-    n_threads = options.n_threads or threads()
+    n_similar = matcher.n_similar if options.n_similar is None else options.n_similar
     chosen = stages.arrays(
         "pairs",
         lambda: {
             "pairs": np.array(
-                choose_pairs(
-                    walk.images, features, seed=seed, n_similar=options.n_similar, n_neighbours=options.n_neighbours
-                ),
+                choose_pairs(walk.images, features, seed=seed, n_similar=n_similar, n_neighbours=options.n_neighbours),
                 dtype=np.int64,
             ).reshape(-1, 2)
         },
@@ -153,7 +162,7 @@ def _match_all(
         def told(done: int, before: int = before) -> None:
             tell("match", before + done, len(pairs))
 
-        make = functools.partial(_matched, share, features, options.ratio, told, n_threads)
+        make = functools.partial(_matched, walk, share, features, matcher, told, options.n_threads or threads())
         stored = stages.arrays(f"matches/{number:06d}", make)
         borders = np.concatenate([[0], np.cumsum(stored["count"].astype(np.int64))])
         matches += [stored["matches"][a:b].astype(np.uint32) for a, b in itertools.pairwise(borders)]
@@ -163,9 +172,15 @@ def _match_all(
 
 
 def _matched(
-    pairs: Sequence[Pair], features: list[Features], ratio: float, tell: Callable[[int], None], n_threads: int
+    walk: MapSource,
+    pairs: Sequence[Pair],
+    features: list[Features],
+    matcher: PairMatcher,
+    tell: Callable[[int], None],
+    n_threads: int,
 ) -> dict[str, NDArray[np.generic]]:
-    made = match_pairs(pairs, features, ratio=ratio, progress=tell, n_threads=n_threads)
+    sizes = [(image.camera.width, image.camera.height) for image in walk.images]
+    made = match_pairs(pairs, features, sizes=sizes, matcher=matcher, progress=tell, n_threads=n_threads)
     return {"count": np.array([len(m) for m in made]), "matches": np.concatenate(made)}
 
 
@@ -175,8 +190,8 @@ def _plausible(found: Matched, options: MapOptions) -> Matched:
     share = sum(map(len, plausible)) / max(sum(map(len, found.matches)), 1)
     if share < options.slam.least_share:
         told = f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"
-        return Matched(found.walk, found.features, found.pairs, found.matches, (told,))
-    return Matched(found.walk, found.features, found.pairs, plausible)
+        return dataclasses.replace(found, disbelieved=(told,))
+    return dataclasses.replace(found, matches=plausible)
 
 
 def _placed(
@@ -278,6 +293,7 @@ def _alignment_entry(a: Alignment) -> AlignmentEntry:
         scale_sigma=a.scale_sigma,
         gravity_from=a.gravity_from,
         reprojection_px=a.reprojection_px,
+        match_share=a.match_share,
     )
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pycolmap
 
-from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, Verdict, align_to_slam
@@ -16,10 +17,11 @@ from fieldkit.maps.known import known_alignment
 from fieldkit.maps.landmarks import Model, model_arrays
 from fieldkit.maps.metric import DepthScale, depth_scale, rescaled, with_depth_scale
 from fieldkit.maps.options import MapOptions, Progress
-from fieldkit.maps.source import MIN_POSES, MapSource, poses_path, read_depth, read_image
-from fieldkit.maps.tagged import TagScale, tag_scale
+from fieldkit.maps.order import walk_order
+from fieldkit.maps.source import MIN_POSES, MapSource, poses_path, read_depth
+from fieldkit.maps.tagged import MIN_IMAGES, TagScale, find_tags, tag_scale
 from fieldkit.maps.upright import Upright, find_upright, up_rotation
-from fieldkit.tags import TagDetection, detect
+from fieldkit.tags import TagDetection
 
 Told = tuple[Alignment, list[str]]
 # Cameras may lean by this on average, lines and floors by a tenth of it, before a map's up is called doubtful
@@ -58,39 +60,56 @@ def find_frame(
     sfm_poses: Mapping[int, Pose],
     options: MapOptions,
     *,
+    tags: Mapping[int, Sequence[TagDetection]],
     seed: int,
-    progress: Progress,
+    match_share: float = 1.0,
 ) -> Told:
     """Return map_from_sfm with its residuals and verdict, and what a user should know about it.
 
     With SLAM's poses the frame is theirs, and tags or depth may refine the scale; without, the first camera is the
-    origin, looks along x, and up is told by the images. Raises MapError when what is asked for cannot be found.
+    origin, looks along x, and up is told by the images. ``tags`` are those that `look_for_tags` found;
+    ``match_share`` says how well poses that are known fit. Raises MapError when what is asked for cannot be found.
     """
     if options.poses == "known":
-        return _by_known(walk, model, sfm_poses)
+        return _by_known(walk, model, sfm_poses, match_share)
     posed = {i: p for i in sfm_poses if (p := walk.images[i].slam_from_cam) is not None}
-    tags = _tags(walk, sfm_poses, options, seed=seed, progress=progress)
-    by_tags = options.scale == "tags" or (options.scale == "auto" and bool(options.tag_sizes_m))
-    told = [] if tags or not by_tags else [_no_tags(options)]
+    sightings = [(pose, walk.images[i].camera, d) for i, pose in sfm_poses.items() for d in tags.get(i, ())]
+    scale = tag_scale(sightings, options.tag_sizes_m, seed=seed)
+    if scale is None and options.scale == "tags":
+        raise _no_tags(walk)
+    told = ["tags give no scale: none is well seen in three placed images"] if tags and scale is None else []
     if walk.n_posed < MIN_POSES:
-        return _by_images(walk, model, sfm_poses, tags if by_tags else None, told)
+        return _by_images(walk, model, sfm_poses, scale, told)
     try:
-        alignment = align_to_slam([sfm_poses[i] for i in posed], list(posed.values()), seed=seed)
+        alignment = align_to_slam(
+            [sfm_poses[i] for i in posed], list(posed.values()), seed=seed, walks=_walks(walk, list(posed))
+        )
     except MapError as error:
         raise MapError(f"{walk.path}: {error.message}", hint=error.hint) from error
     told += _doubts(alignment)
     centres = np.stack([sfm_poses[i].translation for i in posed]), np.stack([p.translation for p in posed.values()])
-    if by_tags and tags is not None:
-        return _scaled_by_tags(alignment, tags, centres, told)
+    if scale is not None:
+        return _scaled_by_tags(alignment, scale, centres, told)
     if options.scale == "slam" or (options.scale == "auto" and walk.depth_camera is None):
         return alignment, told
     found = _depth_ratio(walk, model, sfm_poses, alignment.map_from_sfm)
+    if found is None and options.scale == "depth":
+        raise _too_little_depth(walk)
     if found is None:
-        return alignment, [*told, *(["depth images show too few landmarks for a scale"] * (options.scale == "depth"))]
+        return alignment, told
     scaled, doubts = with_depth_scale(
         alignment, found, sfm_centres=centres[0], slam_centres=centres[1], anyway=options.scale == "depth"
     )
     return scaled, told + doubts
+
+
+def _walks(walk: MapSource, posed: Sequence[int]) -> list[list[int]]:
+    """Return, for each sequence, the rows of ``posed`` of its images in the order in which they were taken."""
+    row = {i: k for k, i in enumerate(posed)}
+    sequences: dict[str, list[int]] = {}
+    for i in posed:
+        sequences.setdefault(walk.images[i].sequence, []).append(i)
+    return [[row[i] for i in walk_order(walk.images, members)] for members in sequences.values()]
 
 
 def _doubts(alignment: Alignment) -> list[str]:
@@ -102,28 +121,30 @@ def _doubts(alignment: Alignment) -> list[str]:
     ]
 
 
-def _no_tags(options: MapOptions) -> str:
-    message = "no tag of known size is seen in three images from different places"
-    if options.scale == "tags":
-        raise MapError(
-            f"{message}; expected one, which gives the scale",
-            hint="check --size-m and --family, and map the tags from nearer and from several sides",
-        )
-    return f"{message}: the scale is not theirs"
+def look_for_tags(walk: MapSource, options: MapOptions, *, progress: Progress) -> dict[int, list[TagDetection]]:
+    """Return the tags of known size in the images (by index) that show any, where the scale may be theirs.
 
-
-def _tags(
-    walk: MapSource, sfm_poses: Mapping[int, Pose], options: MapOptions, *, seed: int, progress: Progress
-) -> TagScale | None:
+    Raises MapError before any SfM where the scale has to be theirs, and too few images show any.
+    """
     if not options.tag_sizes_m or options.scale not in ("auto", "tags"):
-        return None
-    sightings: list[tuple[Pose, Camera, TagDetection]] = []
-    for done, (i, pose) in enumerate(sfm_poses.items(), start=1):
-        image = walk.images[i]
-        for found in detect(read_image(image), image.camera, families=options.tag_families):
-            sightings.append((pose, image.camera, found))
-        progress("tags", done, len(sfm_poses))
-    return tag_scale(sightings, options.tag_sizes_m, seed=seed)
+        return {}
+    told = functools.partial(progress, "tags")
+    found = find_tags(
+        walk, options.tag_sizes_m, options.tag_families, progress=lambda done: told(done, len(walk.images))
+    )
+    counts = collections.Counter(d.id for seen in found.values() for d in seen)
+    alone = walk.n_posed < MIN_POSES and walk.depth_camera is None
+    if (options.scale == "tags" or alone) and max(counts.values(), default=0) < MIN_IMAGES:
+        raise _no_tags(walk)
+    return found
+
+
+def _no_tags(walk: MapSource) -> MapError:
+    return MapError(
+        f"{walk.path}: no tag of known size is seen in {MIN_IMAGES} images from different places; expected one, which "
+        "gives the scale",
+        hint="check --size-m and --family, and map the tags from nearer and from several sides",
+    )
 
 
 def _scaled_by_tags(
@@ -181,14 +202,17 @@ def _by_images(
         if abs(change - 1.0) < 1e-4:
             break
     if found is None:
-        raise MapError(
-            f"{walk.path}: {'the depth images show too few landmarks' if walk.depth_camera else 'no tag was seen'}; "
-            "expected poses, tags of known size or depth images: the scale of the map is unknown",
-            hint=f"add {poses_path(walk.path).name}, or hang up AprilTags and give --size-m METRES",
-        )
+        raise _too_little_depth(walk) if walk.depth_camera else _no_tags(walk)
     verdict = _worst(_scale_verdict(found.sigma, 0.0), _gravity_verdict(up))
     numbers = found.n_used, found.n, found.rms_m, found.p95_m
     return Alignment(unit, "depth", *numbers, up.sigma_deg, 0.0, verdict, up.source, found.sigma), told
+
+
+def _too_little_depth(walk: MapSource) -> MapError:
+    return MapError(
+        f"{walk.path / 'depth'}: the depth images show too few landmarks; expected more, for the scale",
+        hint=f"add {poses_path(walk.path).name}, or hang up AprilTags and give --size-m METRES",
+    )
 
 
 def _gravity_told(up: Upright) -> str:
@@ -200,16 +224,18 @@ def _gravity_told(up: Upright) -> str:
     return f"nothing measured gravity: up is known to {up.sigma_deg:.2f} deg if {assumed}"
 
 
-def _by_known(walk: MapSource, model: pycolmap.Reconstruction | Model, poses: Mapping[int, Pose]) -> Told:
+def _by_known(
+    walk: MapSource, model: pycolmap.Reconstruction | Model, poses: Mapping[int, Pose], share: float
+) -> Told:
+    assert not isinstance(model, Model)
     up = find_upright(walk, poses)
     tilt = float(np.degrees(np.arccos(np.clip(up.up_in_sfm[2], -1.0, 1.0))))
-    assert not isinstance(model, Model)
-    alignment = known_alignment(model, poses, (tilt, up.sigma_deg))
+    alignment = known_alignment(model, poses, share=share, tilt=(tilt, up.sigma_deg))
     told = []
     if alignment.verdict != "pass":
         told.append(
-            f"known poses, verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} images fit, rms "
-            f"{alignment.reprojection_px:.2f} px, up {tilt:.1f} +- {up.sigma_deg:.1f} deg from z as the images show it"
+            f"known poses, verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} images see points, "
+            f"{100 * share:.0f} % of the matches fit, up is {tilt:.1f} +- {up.sigma_deg:.1f} deg off z in the images"
         )
     found = _depth_ratio(walk, model, poses, alignment.map_from_sfm)
     if found is not None and abs(found.ratio - 1.0) > max(0.02, 4.0 * found.sigma):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -38,6 +39,7 @@ class AlignmentEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scale_sigma: float | None = None
     gravity_from: Literal["slam", "floor", "verticals", "cameras", "known"] | None = None
     reprojection_px: float | None = None
+    match_share: float | None = None
 
 
 class SurfaceEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -101,9 +103,21 @@ def read_map_file(path: Path) -> MapFile:
         raise MapError(f"{path}: no such folder; expected a map folder", hint="build one with `fieldkit map build`")
     if not (path / "map.toml").is_file():
         raise MapError(f"{path}: no map.toml in it; expected a map folder", hint="build one with `fieldkit map build`")
+    _refuse_old(path / "map.toml")
     entry = read_toml(path / "map.toml", MapFile, what="map.toml of fieldkit")
     _refuse_wrong_numbers(path / "map.toml", entry)
     return entry
+
+
+def _refuse_old(path: Path) -> None:
+    """Raise MapError for a map.toml of an older version than any that is read; newer ones `read_toml` refuses."""
+    try:
+        version = tomllib.loads(path.read_text(encoding="utf-8")).get("version")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return
+    if not isinstance(version, int) or version < 1:
+        found = "has no version" if version is None else f"version {version!r}"
+        raise MapError(f"{path}: {found}; this fieldkit reads version 1", hint="build or import the map again")
 
 
 def _refuse_wrong_numbers(path: Path, entry: MapFile) -> None:

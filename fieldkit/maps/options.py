@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Literal
 
 from fieldkit.errors import MapError
+from fieldkit.features.matchers import MatcherName
 from fieldkit.maps.align import Alignment
 from fieldkit.maps.io import positive
 from fieldkit.maps.landmarks import LandmarkRules
 from fieldkit.maps.plausible import SlamRules
+from fieldkit.tags.families import find_family
 
 Progress = Callable[[str, int, int], None]
 
@@ -23,15 +26,19 @@ class MapOptions:
     "known" are taken as they are, "none" are not read. ``scale`` "auto" takes tags where ``tag_sizes_m`` gives the edge
     of any (by id, None for all others), else depth images where there are any, else SLAM; "slam", "tags" and "depth"
     take just those. ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches.
-    ``n_threads`` is by default the number of processors; it does not change the map, and is no part of what the
-    options are told by, nor is ``keep_record``: whether seconds and versions are written into the map folder.
-    Raises MapError when a length or a count is not positive, or options contradict each other.
+    ``n_similar`` is to how many similar images every image is matched, by default what the matcher is fast enough for.
+    ``weights`` is a folder where networks' weights are looked for first, ``n_threads`` by default the number of
+    processors, which does not change the map, and ``keep_record`` writes seconds and versions into the map folder:
+    these three are no part of what the options are told by.
+    Raises MapError when a length or a count is not positive, or options contradict each other, and TagError for an
+    unknown family.
     """
 
     max_keypoints: int = 2048
     max_image_size: int | None = 1600
+    matcher: MatcherName = "nearest"
     ratio: float = 0.8
-    n_similar: int = 20
+    n_similar: int | None = None
     n_neighbours: int = 3
     min_registered: float = 0.5
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
@@ -43,6 +50,7 @@ class MapOptions:
     voxel_m: float = 0.04
     truncation_voxels: float = 3.5
     max_depth_m: float = 6.0
+    weights: Path | None = dataclasses.field(default=None, repr=False, compare=False)
     n_threads: int | None = dataclasses.field(default=None, repr=False, compare=False)
     keep_record: bool = dataclasses.field(default=True, repr=False, compare=False)
 
@@ -53,6 +61,8 @@ class MapOptions:
             positive("n_threads", self.n_threads)
         for tag_id, size_m in self.tag_sizes_m.items():
             positive("size_m of tags" if tag_id is None else f"size_m of tag {tag_id}", size_m)
+        for family in self.tag_families:
+            find_family(family)
         if self.scale == "tags" and not self.tag_sizes_m:
             raise MapError("scale by tags without a tag's size; expected one", hint="give --size-m METRES or ID:METRES")
         if self.poses == "known" and self.scale != "auto":

@@ -17,7 +17,7 @@ from fieldkit.features import Features
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment
 from fieldkit.maps.framing import find_frame
-from fieldkit.maps.known import triangulate
+from fieldkit.maps.known import match_share, triangulate
 from fieldkit.maps.options import MapOptions, Progress
 from fieldkit.maps.pairs import Pair
 from fieldkit.maps.plausible import SlamRules, plausible_pairs
@@ -25,6 +25,7 @@ from fieldkit.maps.sfm import quiet_colmap, reconstruct, relative_poses, threads
 from fieldkit.maps.source import MapSource
 from fieldkit.maps.stages import Stages
 from fieldkit.maps.strays import contradicting
+from fieldkit.tags import TagDetection
 
 # A few misplaced images are left out; of more than this share the rest is bent too, and SfM starts again.
 _FOLDED = 0.05
@@ -33,13 +34,17 @@ _NAMES = 4
 
 @dataclasses.dataclass(frozen=True)
 class Matched:
-    """What SfM starts from; ``disbelieved`` says why SLAM's poses ruled out nothing, if they did not."""
+    """What SfM starts from, and the tags that images show.
+
+    ``disbelieved`` says why SLAM's poses ruled out nothing, if they did not.
+    """
 
     walk: MapSource
     features: Sequence[Features]
     pairs: Sequence[Pair]
     matches: Sequence[NDArray[np.uint32]]
     disbelieved: tuple[str, ...] = ()
+    tags: Mapping[int, Sequence[TagDetection]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,23 +93,24 @@ def place_once(
             progress=progress,
         )
 
+    def grow(database: Path) -> Sequence[pycolmap.Reconstruction]:
+        try:
+            if options.poses == "known":
+                return [triangulate(database, walk.images)]
+            return reconstruct(database, walk.images, seed=seed, progress=progress)
+        except MapError as error:
+            raise MapError(f"{walk.path}: {error.message}", hint=error.hint) from error
+
     with stages.timed("verify"):
         database = stages.put(f"pairs-{name}", verify) / "database.db"
     with stages.timed("reconstruct"):
-        if options.poses == "known":
-            folder = stages.put(
-                f"models-{name}", lambda part: _write_models(part, [triangulate(database, walk.images)])
-            )
-        else:
-            folder = stages.put(
-                f"models-{name}",
-                lambda part: _write_models(part, reconstruct(database, walk.images, seed=seed, progress=progress)),
-            )
+        folder = stages.put(f"models-{name}", lambda part: _write_models(part, grow(database)))
         with quiet_colmap():
             model = pycolmap.Reconstruction(folder / "0")
         poses, pieces = _registered(walk, model, folder, options)
+    share = match_share(database, walk.images) if options.poses == "known" else 1.0
     with stages.timed("align"):
-        alignment, warnings = find_frame(walk, model, poses, options, seed=seed, progress=progress)
+        alignment, warnings = find_frame(walk, model, poses, options, tags=found.tags, seed=seed, match_share=share)
         mapped = {i: alignment.map_from_sfm.pose(p) for i, p in poses.items()}
         far = contradicting(walk.images, mapped, threshold_m=alignment.threshold_m)
     return Placing(model, poses, alignment, (*pieces, *warnings), len(far))

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldkit import features
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import read_grey
 from fieldkit.frames import Pose
 from fieldkit.maps.stamps import NamedPoses
 from fieldkit.store import calibration_file, read_camera, read_rig, read_tum
@@ -75,9 +75,9 @@ def without_poses(source: MapSource) -> MapSource:
     return dataclasses.replace(source, images=images)
 
 
-def read_image(image: SourceImage) -> Image:
-    """Read a mapping image as its camera sees it, uint8[h, w]; raises FeatureError when it cannot be read."""
-    return np.ascontiguousarray(np.rot90(read_grey(image.file), -image.turns))
+def read_image(image: SourceImage, *, colour: bool = False) -> Image:
+    """Read a mapping image as its camera sees it, uint8[h, w] or uint8[h, w, 3] RGB; raises FeatureError if not one."""
+    return np.ascontiguousarray(np.rot90(features.read_image(image.file, colour=colour), -image.turns))
 
 
 def along_axis(depth_mm: NDArray[np.uint16], frame: DepthFrame) -> NDArray[np.uint16]:

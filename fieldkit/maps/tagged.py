@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Similarity, umeyama
-from fieldkit.tags import TagDetection, tag_corners
+from fieldkit.maps.source import MapSource, read_image
+from fieldkit.tags import TagDetection, detect, tag_corners
 
 Array = NDArray[np.float64]
 
@@ -22,10 +23,23 @@ Array = NDArray[np.float64]
 _FAR_PX, _FAR_SIGMAS = 4.0, 6.0
 # What SfM's poses and keypoints are off by, however sharp a corner is
 _SFM_SIGMA_PX = 0.3
-_MIN_IMAGES = 3
+MIN_IMAGES = 3
 # No printed tag and no ruler is better than this
 _LEAST_SIGMA = 0.001
 _MOST_PAIRS = 100
+
+
+def find_tags(
+    walk: MapSource, sizes_m: Mapping[int | None, float], families: Sequence[str], *, progress: Callable[[int], None]
+) -> dict[int, list[TagDetection]]:
+    """Return the tags of known size in every mapping image (by index) that shows any."""
+    result: dict[int, list[TagDetection]] = {}
+    for i, image in enumerate(walk.images):
+        seen = detect(read_image(image), image.camera, families=families)
+        if known := [d for d in seen if d.id in sizes_m or None in sizes_m]:
+            result[i] = known
+        progress(i + 1)
+    return result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,8 +103,7 @@ def tag_scale(
     """
     tags: dict[int, list[_Seen]] = {}
     for pose, camera, detection in sightings:
-        if detection.id in sizes_m or None in sizes_m:
-            tags.setdefault(detection.id, []).append(_Seen(pose, camera, detection))
+        tags.setdefault(detection.id, []).append(_Seen(pose, camera, detection))
     fits: dict[int, _TagFit] = {}
     for tag_id, seen in sorted(tags.items()):
         size_m = sizes_m.get(tag_id, sizes_m.get(None, np.nan))
@@ -134,7 +147,7 @@ def _fit(seen: Sequence[_Seen], size_m: float, *, rng: np.random.Generator) -> _
     near = _near(seen, start.points(square))
     for _ in range(3):
         used = [s for s, keep in zip(seen, near, strict=True) if keep]
-        if len(used) < _MIN_IMAGES:
+        if len(used) < MIN_IMAGES:
             return None
         similarity, sigma = _adjusted(used, start)
         again = _near(seen, similarity.points(square))
@@ -161,7 +174,7 @@ def _start(seen: Sequence[_Seen], rng: np.random.Generator) -> Similarity | None
     pairs = list(itertools.combinations(range(len(seen)), 2))
     if len(pairs) > _MOST_PAIRS:
         pairs = [pairs[k] for k in rng.choice(len(pairs), _MOST_PAIRS, replace=False)]
-    best, most = None, (_MIN_IMAGES - 1, 0.0)
+    best, most = None, (MIN_IMAGES - 1, 0.0)
     for a, b in pairs:
         corners = _triangulated([seen[a], seen[b]])
         if corners is None:
