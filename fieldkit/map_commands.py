@@ -72,6 +72,7 @@ def map_import(
     out: Path,
     images: Path | None = None,
     feature: str = "sift",
+    weights: Path | None = None,
     poses: Path | None = None,
     scale: float | None = None,
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z",
@@ -96,6 +97,7 @@ def map_import(
         out: map folder to write
         images: folder that the model's image names start from
         feature: local feature of the descriptors
+        weights: folder where the weights of networks are looked for first
         poses: TUM poses of the model's images, z up: give scale and frame
         scale: metres per unit of the model, where there are no poses: 1 for a metric model
         up: axis of the model that points up, with --scale
@@ -120,7 +122,7 @@ def map_import(
     sizes_m = parse_sizes(size_m) if size_m else {}
     frame = maps.FrameOptions(poses, scale, up, sizes_m, family or ("tag36h11",), depth, depth_camera)
     rules = maps.LandmarkRules(min_images=min_images)
-    options = maps.ImportOptions(feature, frame, features, database, meshed, rules)
+    options = maps.ImportOptions(feature, frame, features, database, meshed, rules, weights)
     with ProgressBars() as progress:
         built = maps.import_map(model, out, images=images, options=options, force=force, progress=progress)
     for warning in built.warnings:

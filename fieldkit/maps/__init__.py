@@ -10,7 +10,7 @@ from fieldkit.maps.io import content_digest, load_map, map_info
 from fieldkit.maps.landmarks import LandmarkRules
 from fieldkit.maps.meshes import ForeignMesh
 from fieldkit.maps.options import MapOptions, MapReport
-from fieldkit.maps.warp import MapWarp, map_warp
+from fieldkit.warp import MapWarp, map_warp
 
 __all__ = [
     "Exported",

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.landmarks import Model, reprojection_errors
+from fieldkit.maps.landmarks import Model
 from fieldkit.maps.sfm import quiet_colmap
+from fieldkit.observations import reprojection_errors
 
 Array = NDArray[np.float64]
 

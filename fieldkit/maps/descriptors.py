@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError
-from fieldkit.maps.landmarks import Model, observations_of
+from fieldkit.maps.landmarks import Model
+from fieldkit.observations import observations_of
 
 # Room for two 8-bit SIFT descriptors of each of a million landmarks
 MAX_BYTES = 256 << 20

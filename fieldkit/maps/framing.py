@@ -224,9 +224,7 @@ def _gravity_told(up: Upright) -> str:
     return f"nothing measured gravity: up is known to {up.sigma_deg:.2f} deg if {assumed}"
 
 
-def _by_known(
-    walk: MapSource, model: pycolmap.Reconstruction | Model, poses: Mapping[int, Pose], share: float
-) -> Told:
+def _by_known(walk: MapSource, model: pycolmap.Reconstruction | Model, poses: Mapping[int, Pose], share: float) -> Told:
     assert not isinstance(model, Model)
     up = find_upright(walk, poses)
     tilt = float(np.degrees(np.arccos(np.clip(up.up_in_sfm[2], -1.0, 1.0))))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity
-from fieldkit.maps.framing import find_frame
+from fieldkit.maps.framing import find_frame, look_for_tags
 from fieldkit.maps.landmarks import Model
 from fieldkit.maps.options import MapOptions, Progress
 from fieldkit.maps.source import MIN_POSES, DepthFrame, MapSource, SourceImage
@@ -72,7 +72,8 @@ def metric_alignment(
         tag_sizes_m=options.tag_sizes_m,
         tag_families=options.tag_families,
     )
-    return find_frame(walk, model, placed, building, seed=seed, progress=progress)
+    tags = look_for_tags(walk, building, progress=progress)
+    return find_frame(walk, model, placed, building, tags=tags, seed=seed)
 
 
 def _stated(model: Model, scale: float, up: Up) -> tuple[Alignment, list[str]]:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError
-from fieldkit.features import Features, feature_kind
+from fieldkit.features import Features, feature_name
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity
+from fieldkit.maps.align import Similarity
+from fieldkit.maps.build import alignment_entry
 from fieldkit.maps.colmap import model_folder, read_model, write_model
 from fieldkit.maps.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
 from fieldkit.maps.import_frame import FrameOptions, metric_alignment
 from fieldkit.maps.io import (
-    AlignmentEntry,
     MapFile,
     SurfaceEntry,
     content_digest,
@@ -49,6 +49,7 @@ class ImportOptions:
     database: Path | None = None
     mesh: ForeignMesh | None = None
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
+    weights: Path | None = None
 
     def __post_init__(self) -> None:
         frame = self.frame
@@ -80,7 +81,7 @@ def import_map(
     """
     options = ImportOptions() if options is None else options
     tell: Progress = progress or (lambda step, done, total: None)
-    feature_kind(options.feature)
+    options = dataclasses.replace(options, feature=feature_name(options.feature))
     refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
     seconds, start = {}, time.perf_counter()
     folder = model_folder(model_path)
@@ -108,7 +109,9 @@ def import_map(
     with atomic_folder(Path(out), force=force, marker="map.toml") as work:
         write_landmark_map(work, model, descriptors, surface)
         digest = content_digest(work)
-        write_map_file(work, MapFile(1, digest, options.feature, *counts, _entry(alignment), _surface_entry(surface)))
+        write_map_file(
+            work, MapFile(1, digest, options.feature, *counts, alignment_entry(alignment), _surface_entry(surface))
+        )
     seconds["write"] = time.perf_counter() - start
     return MapReport(str(out), digest, *counts, alignment, surface is not None, seconds, tuple(warnings))
 
@@ -160,7 +163,7 @@ def _descriptors(model: Model, images: Path | None, options: ImportOptions, tell
     if options.database is not None:
         return database_descriptors(options.database, model, feature=options.feature)
     assert images is not None
-    return image_descriptors(images, model, feature=options.feature, progress=tell)
+    return image_descriptors(images, model, feature=options.feature, progress=tell, weights=options.weights)
 
 
 def _described(model: Model, descriptors: NDArray[Any]) -> list[str]:
@@ -191,12 +194,6 @@ def write_landmark_map(folder: Path, model: Model, descriptors: NDArray[Any], su
     write_features(folder / "features.h5", features, sizes)
     if surface is not None:
         write_ply(folder / "surface.ply", surface)
-
-
-def _entry(a: Alignment) -> AlignmentEntry:
-    return AlignmentEntry(
-        a.source, a.map_from_sfm.scale, a.n_used, a.n_total, a.rms_m, a.p95_m, a.gravity_deg, a.verdict
-    )
 
 
 def _surface_entry(surface: Surface | None) -> SurfaceEntry | None:
