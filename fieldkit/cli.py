@@ -19,7 +19,7 @@ from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
 from fieldkit.localize_commands import localize
-from fieldkit.map_commands import map_build, map_compact, map_info
+from fieldkit.map_commands import map_build, map_compact, map_export, map_import, map_info
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
 from fieldkit.tag_tables import print_second, print_tags, second_json, tags_json
 
@@ -273,7 +273,13 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "judge": judge,
 }
 GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
-    "map": {"build": map_build, "info": map_info, "compact": map_compact},
+    "map": {
+        "build": map_build,
+        "import": map_import,
+        "export": map_export,
+        "info": map_info,
+        "compact": map_compact,
+    },
     "tags": {
         "sheet": tags_sheet,
         "calibrate": tags_calibrate,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from fieldkit.features import FEATURES, Features
 from fieldkit.maps.colmap import read_model
 from fieldkit.maps.descriptors import read_landmark_descriptors
 from fieldkit.maps.landmarks import landmark_covariance
+from fieldkit.maps.record import read_record
 from fieldkit.store import digest, read_toml, write_toml
 from fieldkit.surface import read_ply
 from fieldkit.types import SceneMap, Surface
@@ -34,6 +36,10 @@ class AlignmentEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     p95_m: float
     gravity_deg: float
     verdict: Literal["pass", "warn", "fail"]
+    scale_sigma: float | None = None
+    gravity_from: Literal["slam", "floor", "verticals", "cameras", "known"] | None = None
+    reprojection_px: float | None = None
+    match_share: float | None = None
 
 
 class SurfaceEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -97,9 +103,21 @@ def read_map_file(path: Path) -> MapFile:
         raise MapError(f"{path}: no such folder; expected a map folder", hint="build one with `fieldkit map build`")
     if not (path / "map.toml").is_file():
         raise MapError(f"{path}: no map.toml in it; expected a map folder", hint="build one with `fieldkit map build`")
+    _refuse_old(path / "map.toml")
     entry = read_toml(path / "map.toml", MapFile, what="map.toml of fieldkit")
     _refuse_wrong_numbers(path / "map.toml", entry)
     return entry
+
+
+def _refuse_old(path: Path) -> None:
+    """Raise MapError for a map.toml of an older version than any that is read; newer ones `read_toml` refuses."""
+    try:
+        version = tomllib.loads(path.read_text(encoding="utf-8")).get("version")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return
+    if not isinstance(version, int) or version < 1:
+        found = "has no version" if version is None else f"version {version!r}"
+        raise MapError(f"{path}: {found}; this fieldkit reads version 1", hint="build or import the map again")
 
 
 def _refuse_wrong_numbers(path: Path, entry: MapFile) -> None:
@@ -126,7 +144,7 @@ def load_map(path: Path) -> SceneMap:
     entry = read_map_file(path)
     if entry.feature not in FEATURES:
         raise MapError(f"{path}: built with feature {entry.feature!r}", hint=suggestion(entry.feature, list(FEATURES)))
-    _refuse_changed(path, entry)
+    refuse_changed(path, entry)
     model = read_model(path / "sparse")
     width = FEATURES[entry.feature].width
     descriptors, rows = read_landmark_descriptors(path / "features.h5", model, width=width)
@@ -152,7 +170,7 @@ def load_map(path: Path) -> SceneMap:
     )
 
 
-def _refuse_changed(path: Path, entry: MapFile) -> None:
+def refuse_changed(path: Path, entry: MapFile) -> None:
     """Raise MapError when files are missing or are not those that map.toml's digest was made of.
 
     COLMAP may read a cut-off model without an error, and results name the digest as what they were made with.
@@ -190,8 +208,10 @@ def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
 
 
 def map_info(path: Path) -> dict[str, Any]:
-    """Return what map.toml says of a map, as plain values, with its path."""
-    return {"path": str(path), **msgspec.to_builtins(read_map_file(path))}
+    """Return what map.toml says of a map, as plain values, with its path, and how it was built where that is kept."""
+    entry, record = read_map_file(path), read_record(Path(path))
+    built = {} if record is None else {"seconds": record.seconds, "versions": record.versions}
+    return {"path": str(path), **msgspec.to_builtins(entry), **built}
 
 
 def write_map_file(path: Path, entry: MapFile) -> None:

@@ -15,6 +15,8 @@ from fieldkit.observations import PRIOR_M, observations_of, projection_jacobian,
 
 Array = NDArray[np.float64]
 
+_INVERTED_TOGETHER = 1 << 16
+
 
 @dataclasses.dataclass(frozen=True)
 class LandmarkRules:
@@ -152,4 +154,8 @@ def landmark_covariance(
     for i, rows in observations_of(observation_image, len(map_from_image)):
         jacobian = projection_jacobian(xyz[observation_landmark[rows]], map_from_image[i], image_cameras[i])
         np.add.at(information, observation_landmark[rows], np.einsum("nki,nkj->nij", jacobian, jacobian) / noise_px**2)
-    return np.asarray(np.linalg.inv(information))
+    # In parts and in place: of a million landmarks two copies are a seventh of a gigabyte
+    for begin in range(0, len(xyz), _INVERTED_TOGETHER):
+        part = slice(begin, begin + _INVERTED_TOGETHER)
+        information[part] = np.linalg.inv(information[part])
+    return information
