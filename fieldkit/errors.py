@@ -40,6 +40,10 @@ class FeatureError(FieldkitError):
     """An unknown feature, or an image from which none can be extracted."""
 
 
+class WeightsError(FieldkitError):
+    """A network's weight file that is missing, damaged, or of another network."""
+
+
 class SurfaceError(FieldkitError):
     """A surface that is missing or cannot be made."""
 

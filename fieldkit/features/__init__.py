@@ -1,4 +1,4 @@
-"""Local features behind one small interface: a visible dict of kinds, one file each, and `extract`."""
+"""Local features behind one small interface: a visible dict of kinds, one file each, `open_extractor` and `extract`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,30 @@ from numpy.typing import NDArray
 
 from fieldkit.errors import FeatureError, suggestion
 from fieldkit.features.akaze import detect_akaze
-from fieldkit.features.sift import detect_sift
+from fieldkit.features.aliked import load_aliked
+from fieldkit.features.images import read_grey, read_image, to_colour, to_grey
+from fieldkit.features.sift import detect_sift, detect_sift_l2
+from fieldkit.features.superpoint import load_superpoint
+from fieldkit.features.xfeat import load_xfeat
 from fieldkit.types import Image
+
+__all__ = [
+    "ALIASES",
+    "FEATURES",
+    "Descriptors",
+    "Extractor",
+    "FeatureKind",
+    "Features",
+    "extract",
+    "feature_kind",
+    "feature_name",
+    "open_extractor",
+    "read_grey",
+    "read_image",
+    "to_colour",
+    "to_grey",
+    "working_factor",
+]
 
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 
@@ -37,87 +59,107 @@ class Features:
 
 
 Detected = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], Descriptors]
+Detect = Callable[[Image, int], Detected]
 
 
 @dataclasses.dataclass(frozen=True)
 class FeatureKind:
     """How a feature is found and matched.
 
-    ``detect(grey, max_keypoints)`` returns keypoints (COLMAP pixels), scores, scales and descriptors, strongest
-    first. ``matching`` says whether the distance ratio of the two nearest separates right matches from wrong ones,
-    or only mutual nearest neighbours do.
+    ``load(folder)`` returns ``detect(image, max_keypoints)``, which returns keypoints (COLMAP pixels), scores, scales
+    and descriptors [n, width] of ``dtype``, strongest first; a network finds its weights there, see `find_weights`.
+    The image is uint8[h, w], or RGB uint8[h, w, 3] where ``colour``. ``matching`` says whether the distance ratio of
+    the two nearest separates right matches from wrong ones, or only mutual nearest neighbours do; such neighbours
+    need a cosine of at least ``min_cosine``. ``lightglue`` names the weights of a LightGlue for this feature.
     """
 
-    detect: Callable[[Image, int], Detected]
+    load: Callable[[Path | None], Detect]
     width: int
     matching: Literal["ratio", "mutual"]
+    dtype: Literal["uint8", "float32"] = "float32"
+    colour: bool = False
+    min_cosine: float = -1.0
+    lightglue: str | None = None
 
 
+# Least similarities: ALIKED's by eight pairs of red kitchen frames (19 of 20 right matches pass, a third of the wrong
+# ones do not), XFeat's as published, SuperPoint's as hloc has it (a distance of 0.7).
 FEATURES: dict[str, FeatureKind] = {
-    "sift": FeatureKind(detect_sift, 128, "ratio"),
-    "akaze": FeatureKind(detect_akaze, 64, "ratio"),
+    "sift": FeatureKind(lambda folder: detect_sift, 128, "ratio", dtype="uint8"),
+    "sift_l2": FeatureKind(lambda folder: detect_sift_l2, 128, "ratio", dtype="uint8"),
+    "akaze": FeatureKind(lambda folder: detect_akaze, 64, "ratio"),
+    "aliked": FeatureKind(load_aliked, 128, "mutual", colour=True, min_cosine=0.6, lightglue="lightglue-aliked"),
+    "xfeat": FeatureKind(load_xfeat, 64, "mutual", colour=True, min_cosine=0.82),
+    "superpoint": FeatureKind(load_superpoint, 256, "mutual", min_cosine=0.755),
 }
+
+# Other accepted names: COLMAP and hloc store RootSIFT as SIFT.
+ALIASES: dict[str, str] = {"rootsift": "sift"}
+
+
+def feature_name(feature: str) -> str:
+    """Return the name under which a feature is stored; raises FeatureError with a suggestion when it is unknown."""
+    name = ALIASES.get(feature, feature)
+    if name not in FEATURES:
+        raise FeatureError(f"unknown feature {feature!r}", hint=suggestion(feature, [*FEATURES, *ALIASES]))
+    return name
 
 
 def feature_kind(feature: str) -> FeatureKind:
     """Return the kind of a feature by name; raises FeatureError with a suggestion when it is unknown."""
-    if feature not in FEATURES:
-        raise FeatureError(f"unknown feature {feature!r}", hint=suggestion(feature, list(FEATURES)))
-    return FEATURES[feature]
+    return FEATURES[feature_name(feature)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Extractor:
+    """An opened feature: its network, if it has one, is loaded once. May be used from several threads."""
+
+    feature: str
+    kind: FeatureKind
+    detect: Detect = dataclasses.field(repr=False)
+    max_keypoints: int
+    max_side_px: int | None
+
+    def extract(self, image: Image) -> Features:
+        """Find the strongest keypoints of an image uint8[h, w] (grey) or uint8[h, w, 3] (RGB).
+
+        An image whose longer side exceeds ``max_side_px`` is reduced first (area average), and its keypoints are
+        scaled back: with pixel centres at (0.5, 0.5) that is a plain multiplication. An image without texture gives
+        no keypoints. Raises FeatureError for an array that is no such image.
+        """
+        ready = to_colour(image) if self.kind.colour else to_grey(image)
+        height, width = ready.shape[:2]
+        factor = working_factor((height, width), max_side_px=self.max_side_px)
+        if factor < 1.0:
+            size = max(round(width * factor), 1), max(round(height * factor), 1)
+            ready = np.asarray(cv2.resize(ready, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        keypoints, scores, scales, descriptors = self.detect(ready, self.max_keypoints)
+        if factor < 1.0:
+            sx, sy = width / ready.shape[1], height / ready.shape[0]
+            keypoints = keypoints * np.array([sx, sy], dtype=np.float32)
+            scales = scales * np.float32(math.sqrt(sx * sy))
+        return Features(keypoints, scores, scales, descriptors)
+
+
+def open_extractor(
+    feature: str, *, weights: Path | None = None, max_keypoints: int = 2048, max_side_px: int | None = 1600
+) -> Extractor:
+    """Open a feature for many images; ``weights`` is a folder where weight files are looked for first.
+
+    Raises FeatureError for an unknown feature, and WeightsError when a network's weights are not found or not its own.
+    """
+    name = feature_name(feature)
+    kind = FEATURES[name]
+    return Extractor(name, kind, kind.load(weights), max_keypoints, max_side_px)
 
 
 def extract(
     image: Image, *, feature: str = "sift", max_keypoints: int = 2048, max_side_px: int | None = 1600
 ) -> Features:
-    """Find the strongest keypoints of an image uint8[h, w] (grey) or uint8[h, w, 3] (RGB).
-
-    An image whose longer side exceeds ``max_side_px`` is reduced first (area average), and its keypoints are
-    scaled back: with pixel centres at (0.5, 0.5) that is a plain multiplication. An image without texture gives
-    no keypoints. Raises FeatureError for an unknown feature or an array that is no such image.
-    """
-    kind = feature_kind(feature)
-    grey = to_grey(image)
-    height, width = grey.shape
-    factor = working_factor((height, width), max_side_px=max_side_px)
-    if factor < 1.0:
-        size = max(round(width * factor), 1), max(round(height * factor), 1)
-        grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    keypoints, scores, scales, descriptors = kind.detect(grey, max_keypoints)
-    if factor < 1.0:
-        sx, sy = width / grey.shape[1], height / grey.shape[0]
-        keypoints = keypoints * np.array([sx, sy], dtype=np.float32)
-        scales = scales * np.float32(math.sqrt(sx * sy))
-    return Features(keypoints, scores, scales, descriptors)
+    """Find the strongest keypoints of one image, as `Extractor.extract` does; a network is loaded for this image."""
+    return open_extractor(feature, max_keypoints=max_keypoints, max_side_px=max_side_px).extract(image)
 
 
 def working_factor(shape: tuple[int, ...], *, max_side_px: int | None) -> float:
     """Return by how much `extract` reduces an image of shape (h, w) first: 1 or less."""
     return 1.0 if max_side_px is None else min(1.0, max_side_px / max(shape[:2]))
-
-
-def to_grey(image: Image) -> Image:
-    """Return uint8[h, w] of a grey or RGB image; raises FeatureError for any other array."""
-    if (
-        image.dtype != np.uint8
-        or image.ndim not in (2, 3)
-        or image.size == 0
-        or (image.ndim == 3 and image.shape[2] != 3)
-    ):
-        raise FeatureError(
-            f"image is {image.dtype}{list(image.shape)}; expected uint8[h, w] grey or uint8[h, w, 3] RGB"
-        )
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    return np.ascontiguousarray(grey, dtype=np.uint8)
-
-
-def read_grey(path: Path) -> Image:
-    """Read an image file as uint8[h, w], as stored: a camera's calibration knows nothing of EXIF turns.
-
-    Raises FeatureError when the file is missing or no readable image.
-    """
-    if not Path(path).is_file():
-        raise FeatureError(f"{path}: no such file; expected an image", hint="check the path")
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise FeatureError(f"{path}: cannot be read as an image; expected JPEG or PNG", hint="check or remove the file")
-    return np.asarray(image, dtype=np.uint8)

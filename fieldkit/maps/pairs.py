@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Features
-from fieldkit.features.matching import match_pair
+from fieldkit.features.matchers import PairMatcher
 from fieldkit.features.vlad import global_descriptor, train_vocabulary
 from fieldkit.maps.source import SourceImage
 
@@ -55,14 +55,19 @@ def match_pairs(
     pairs: Sequence[Pair],
     features: Sequence[Features],
     *,
-    ratio: float,
+    sizes: Sequence[tuple[int, int]],
+    matcher: PairMatcher,
     progress: Callable[[int], None] | None = None,
     n_threads: int = 2,
 ) -> list[NDArray[np.uint32]]:
-    """Match the descriptors of every pair; the result does not depend on the number of threads."""
+    """Match the features of every pair of images, whose ``sizes`` are (width, height).
+
+    The result does not depend on the number of threads.
+    """
 
     def one(pair: Pair) -> NDArray[np.uint32]:
-        return match_pair(features[pair[0]].descriptors, features[pair[1]].descriptors, ratio=ratio)
+        i, j = pair
+        return matcher.match(features[i], sizes[i], features[j], sizes[j])
 
     results = []
     with ThreadPoolExecutor(n_threads) as pool:
