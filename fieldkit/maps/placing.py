@@ -96,7 +96,10 @@ def place_once(
     def grow(database: Path) -> Sequence[pycolmap.Reconstruction]:
         try:
             if options.poses == "known":
-                return [triangulate(database, walk.images)]
+                progress("triangulate", 0, 1)
+                model = triangulate(database, walk.images)
+                progress("triangulate", 1, 1)
+                return [model]
             return reconstruct(database, walk.images, seed=seed, progress=progress)
         except MapError as error:
             raise MapError(f"{walk.path}: {error.message}", hint=error.hint) from error
@@ -165,8 +168,8 @@ def _registered(
     others = [left for piece in pieces[1:] if (left := sorted(set(piece) - set(poses)))]
     apart = "".join(f"; {len(left)} others ({_named(walk, left)}) hang together by themselves" for left in others)
     if options.poses == "known":
-        lost = walk.n_posed
-        return poses, [f"{lost} of {len(walk.images)} images have a pose"] if lost < len(walk.images) else []
+        posed = f"{walk.n_posed} of {len(walk.images)} images have a pose"
+        return poses, [] if walk.n_posed == len(walk.images) else [posed]
     if len(poses) < max(3, options.min_registered * len(walk.images)):
         raise MapError(
             f"{walk.path}: {len(poses)} of {len(walk.images)} images registered{apart}; expected at least half, and 3",
