@@ -25,7 +25,7 @@ def linearise(  # type: ignore[no-untyped-def]
     position,
     rows,
     by_landmark,
-):  # type: ignore[no-untyped-def]
+):
     """Fill whitened ``rows`` f64[n, 2, 7] and ``by_landmark`` f64[n, 2, 3] of matches at a pose map_from_rig.
 
     Match n is seen by the camera ``camera[n]``, of which rig_from_cam is in ``rig_rotation`` f64[c, 3, 3] and
@@ -117,7 +117,7 @@ def refine(  # type: ignore[no-untyped-def]
     iterations,
     rows,
     by_landmark,
-):  # type: ignore[no-untyped-def]
+):
     """Move ``rotation`` (3, 3) and ``position`` (3) to the least Cauchy cost by reweighted Gauss-Newton.
 
     Weights are 1 / (1 + r^2 / ``squared_scale``) of whitened residuals r; ``rows`` and ``by_landmark`` as of
