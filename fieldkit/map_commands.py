@@ -72,9 +72,14 @@ def map_import(
     out: Path,
     images: Path | None = None,
     feature: str = "sift",
+    weights: Path | None = None,
     poses: Path | None = None,
     scale: float | None = None,
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z",
+    size_m: Repeated[tuple[str, ...]] = (),
+    family: Repeated[tuple[str, ...]] = (),
+    depth: Path | None = None,
+    depth_camera: Path | None = None,
     features: Path | None = None,
     database: Path | None = None,
     mesh: Path | None = None,
@@ -92,9 +97,14 @@ def map_import(
         out: map folder to write
         images: folder that the model's image names start from
         feature: local feature of the descriptors
+        weights: folder where the weights of networks are looked for first
         poses: TUM poses of the model's images, z up: give scale and frame
         scale: metres per unit of the model, where there are no poses: 1 for a metric model
         up: axis of the model that points up, with --scale
+        size_m: edge length in m of the AprilTags in the images, or ID:SIZE for one tag; may be repeated
+        family: tag family, by default tag36h11; may be repeated
+        depth: folder of the images' depth images, 16-bit mm, which give the scale
+        depth_camera: camera.toml of the depth images
         features: features.h5 with which hloc made the model; by default descriptors are extracted from the images
         database: COLMAP database with which the model was made
         mesh: PLY, OBJ, GLB or STL file as surface
@@ -106,10 +116,13 @@ def map_import(
         force: replace an existing map
     """
     from fieldkit import maps
+    from fieldkit.calibrate import parse_sizes
 
     meshed = None if mesh is None else maps.ForeignMesh(mesh, mesh_transform, mesh_unit, mesh_up, mesh_voxel_m)
+    sizes_m = parse_sizes(size_m) if size_m else {}
+    frame = maps.FrameOptions(poses, scale, up, sizes_m, family or ("tag36h11",), depth, depth_camera)
     rules = maps.LandmarkRules(min_images=min_images)
-    options = maps.ImportOptions(feature, poses, scale, up, features, database, meshed, rules)
+    options = maps.ImportOptions(feature, frame, features, database, meshed, rules, weights)
     with ProgressBars() as progress:
         built = maps.import_map(model, out, images=images, options=options, force=force, progress=progress)
     for warning in built.warnings:

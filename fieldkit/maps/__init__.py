@@ -4,16 +4,18 @@ from fieldkit.maps.build import build_map
 from fieldkit.maps.compact import compact_map
 from fieldkit.maps.exporting import Exported, export_map
 from fieldkit.maps.gauge import Gauge, fit_gauge
+from fieldkit.maps.import_frame import FrameOptions
 from fieldkit.maps.importing import ImportOptions, import_map
 from fieldkit.maps.io import content_digest, load_map, map_info
 from fieldkit.maps.landmarks import LandmarkRules
 from fieldkit.maps.meshes import ForeignMesh
 from fieldkit.maps.options import MapOptions, MapReport
-from fieldkit.maps.warp import MapWarp, map_warp
+from fieldkit.warp import MapWarp, map_warp
 
 __all__ = [
     "Exported",
     "ForeignMesh",
+    "FrameOptions",
     "Gauge",
     "ImportOptions",
     "LandmarkRules",

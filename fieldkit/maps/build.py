@@ -103,7 +103,7 @@ def build_map(
         with stages.timed("write"), atomic_folder(out, force=force, marker="map.toml") as folder:
             _write(folder, walk, model, features, mapped, surface)
             made = content_digest(folder)
-            places = _alignment_entry(alignment), _surface_entry(surface, options)
+            places = alignment_entry(alignment), _surface_entry(surface, options)
             write_map_file(folder, MapFile(1, made, feature, *counts, *places))
             if options.keep_record:
                 write_record(folder, dict(stages.seconds), versions=versions, options=repr(options), told=told)
@@ -281,7 +281,8 @@ def _write(
         write_ply(folder / "surface.ply", surface)
 
 
-def _alignment_entry(a: Alignment) -> AlignmentEntry:
+def alignment_entry(a: Alignment) -> AlignmentEntry:
+    """Return [alignment] of map.toml."""
     return AlignmentEntry(
         a.source,
         a.map_from_sfm.scale,

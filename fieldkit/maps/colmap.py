@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.landmarks import Model, reprojection_errors
+from fieldkit.maps.landmarks import Model
 from fieldkit.maps.sfm import quiet_colmap
+from fieldkit.observations import reprojection_errors
 
 Array = NDArray[np.float64]
 
@@ -89,26 +90,23 @@ def _read_binary(folder: Path) -> Model:
     try:
         cameras = _read_cameras(folder / "cameras.bin")
         point_ids, xyz = _read_points(folder / "points3D.bin")
-        images = _read_images(folder / "images.bin")
-        owner = [cameras[image.camera_id] for image in images]
-    except (ValueError, struct.error, OSError, KeyError, OverflowError, UnicodeDecodeError) as error:
+        with (folder / "images.bin").open("rb") as file:
+            heads = _image_heads(file)
+            owner = tuple(cameras[head.camera_id] for head in heads)
+            count, landmark, keypoint, pixels = _observations(file, heads, point_ids)
+    except (ValueError, struct.error, OSError, KeyError, OverflowError, UnicodeDecodeError, MemoryError) as error:
         raise _damaged(folder) from error
-    count = [len(image.point) for image in images]
-    point = np.concatenate([np.zeros(0, dtype=np.int64), *(image.point for image in images)])
-    landmark = np.searchsorted(point_ids, point).astype(np.int32)
-    if len(point) and (not len(point_ids) or (point_ids[np.minimum(landmark, len(point_ids) - 1)] != point).any()):
-        raise _damaged(folder)
-    del point
+    image = np.repeat(np.arange(len(heads), dtype=np.int32), count)
     return Model(
-        tuple(image.name for image in images),
-        tuple(owner),
-        tuple(image.map_from_cam for image in images),
+        tuple(head.name for head in heads),
+        owner,
+        tuple(head.map_from_cam for head in heads),
         xyz,
         point_ids,
         landmark,
-        np.repeat(np.arange(len(images), dtype=np.int32), count),
-        np.concatenate([np.zeros(0, dtype=np.int32), *(image.keypoint for image in images)]),
-        np.concatenate([np.zeros((0, 2), dtype=np.float32), *(image.pixels for image in images)]),
+        image,
+        keypoint,
+        pixels,
     )
 
 
@@ -144,32 +142,54 @@ def _camera(path: Path, number: int, name: str, size: tuple[int, int], params: t
 
 
 @dataclasses.dataclass(frozen=True)
-class _Image:
+class _Head:
+    """An image without its keypoints, of which there are ``n`` at ``offset`` in the file."""
+
     name: str
     camera_id: int
     map_from_cam: Pose
-    point: NDArray[np.int64]
-    keypoint: NDArray[np.int32]
-    pixels: NDArray[np.float32]
+    offset: int
+    n: int
 
 
-def _read_images(path: Path) -> list[_Image]:
+def _image_heads(file: io.BufferedReader) -> list[_Head]:
     """Return the images sorted by name."""
-    images = []
-    with path.open("rb") as file:
-        for _ in range(_unpack(file, "<Q")[0]):
-            head = _unpack(file, "<I7dI")
-            name = _read_name(file)
-            (n,) = _unpack(file, "<Q")
-            content = file.read(_OBSERVATION.itemsize * n)
-            rows = np.frombuffer(content, dtype=_OBSERVATION)
-            if len(rows) != n:
-                raise ValueError("cut off")
-            seen = np.flatnonzero(rows["point"] != -1)
-            pose = _pose(np.array(head[1:5]), np.array(head[5:8]))
-            pixels = rows["xy"][seen].astype(np.float32)
-            images.append(_Image(name, head[8], pose, rows["point"][seen], seen.astype(np.int32), pixels))
-    return sorted(images, key=lambda image: image.name)
+    heads = []
+    for _ in range(_unpack(file, "<Q")[0]):
+        numbers = _unpack(file, "<I7dI")
+        name = _read_name(file)
+        (n,) = _unpack(file, "<Q")
+        pose = _pose(np.array(numbers[1:5]), np.array(numbers[5:8]))
+        heads.append(_Head(name, numbers[8], pose, file.tell(), n))
+        file.seek(_OBSERVATION.itemsize * n, io.SEEK_CUR)
+    return sorted(heads, key=lambda head: head.name)
+
+
+def _observations(
+    file: io.BufferedReader, heads: Sequence[_Head], point_ids: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    """Return how many points each image observes, and of every observation landmark, keypoint and pixel (o, 2).
+
+    Room is made for all keypoints at once: what is not written to is never given memory, and nothing is copied.
+    """
+    room = min(sum(head.n for head in heads), file.seek(0, io.SEEK_END) // _OBSERVATION.itemsize)
+    landmark, keypoint = np.empty(room, dtype=np.int32), np.empty(room, dtype=np.int32)
+    pixels, count, end = np.empty((room, 2), dtype=np.float32), np.zeros(len(heads), dtype=np.int64), 0
+    for i, head in enumerate(heads):
+        file.seek(head.offset)
+        rows = np.frombuffer(file.read(_OBSERVATION.itemsize * head.n), dtype=_OBSERVATION)
+        if len(rows) != head.n:
+            raise ValueError("cut off")
+        seen = np.flatnonzero(rows["point"] != -1)
+        found = np.searchsorted(point_ids, rows["point"][seen])
+        if len(seen) and (
+            not len(point_ids) or (point_ids[np.minimum(found, len(point_ids) - 1)] != rows["point"][seen]).any()
+        ):
+            raise ValueError("a keypoint observes a point that is not there")
+        part = slice(end, end + len(seen))
+        landmark[part], keypoint[part], pixels[part] = found, seen, rows["xy"][seen]
+        count[i], end = len(seen), part.stop
+    return count, landmark[:end], keypoint[:end], pixels[:end]
 
 
 def _unpack(file: io.BufferedReader, layout: str) -> tuple[int, ...]:

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fieldkit.errors import MapError
-from fieldkit.features import FEATURES, extract, feature_kind, read_grey
-from fieldkit.maps.landmarks import Model, observations_of
+from fieldkit.features import FEATURES, feature_kind, open_extractor, read_image
+from fieldkit.maps.landmarks import Model
 from fieldkit.maps.sfm import threads
+from fieldkit.observations import observations_of
 
 Pixels = NDArray[np.float32]
 # Keypoints (n, 2) in COLMAP pixels and descriptors (n, w) of one image
@@ -168,7 +169,12 @@ def _other_feature(path: Path, what: str, feature: str) -> MapError:
 
 
 def image_descriptors(
-    folder: Path, model: Model, *, feature: str, progress: Callable[[str, int, int], None]
+    folder: Path,
+    model: Model,
+    *,
+    feature: str,
+    progress: Callable[[str, int, int], None],
+    weights: Path | None = None,
 ) -> NDArray[Any]:
     """Return descriptors (o, w) of a model's observations, extracted from its images; zero where there is none.
 
@@ -177,17 +183,18 @@ def image_descriptors(
     """
     refuse_missing(folder, model)
     bounds = observations_of(model.observation_image, len(model.image_names))
-    width, result = feature_kind(feature).width, None
+    extractor = open_extractor(feature, weights=weights, max_keypoints=_MAX_KEYPOINTS, max_side_px=_MAX_SIDE_PX)
+    width, result = extractor.kind.width, None
 
     def one(i: int) -> Found:
         file, camera = Path(folder) / model.image_names[i], model.image_cameras[i]
-        grey = read_grey(file)
-        if grey.shape != (camera.height, camera.width):
+        image = read_image(file, colour=extractor.kind.colour)
+        if image.shape[:2] != (camera.height, camera.width):
             raise MapError(
-                f"{file}: is {grey.shape[1]}x{grey.shape[0]}; its camera says {camera.width}x{camera.height}",
+                f"{file}: is {image.shape[1]}x{image.shape[0]}; its camera says {camera.width}x{camera.height}",
                 hint="give the images with which the model was made",
             )
-        found = extract(grey, feature=feature, max_keypoints=_MAX_KEYPOINTS, max_side_px=_MAX_SIDE_PX)
+        found = extractor.extract(image)
         return found.keypoints_px, found.descriptors
 
     with ThreadPoolExecutor(threads()) as pool:

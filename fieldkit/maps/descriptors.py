@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError
-from fieldkit.maps.landmarks import Model, observations_of
+from fieldkit.maps.landmarks import Model
+from fieldkit.observations import observations_of
 
 # Room for two 8-bit SIFT descriptors of each of a million landmarks
 MAX_BYTES = 256 << 20
@@ -101,56 +103,72 @@ def _count(model: Model, described: NDArray[np.int64], room: int) -> int:
     """Return how many descriptors of each landmark fit into ``room`` rows, at least 1."""
     owned = np.bincount(model.observation_landmark[described])
     count = 1
-    while count < owned.max(initial=0) and np.minimum(owned, count + 1).sum() <= room:
+    while count < min(int(owned.max(initial=0)), 255) and np.minimum(owned, count + 1).sum() <= room:
         count += 1
     return count
 
 
-def _view_rank(model: Model, rows: NDArray[np.int64]) -> NDArray[np.int32]:
+def _view_rank(model: Model, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Rank observations int64[d] among those of their landmark: the most usual view first, then the most different.
 
-    Views differ by direction and by the logarithm of their distance.
+    Views differ by direction and by the logarithm of their distance. Ranks end at 255.
     """
-    landmark, image = model.observation_landmark[rows], model.observation_image[rows]
-    centres = np.stack([p.translation for p in model.map_from_image]).astype(np.float32)
-    views = centres[image] - model.xyz[landmark].astype(np.float32)
-    distance = np.maximum(np.linalg.norm(views, axis=1), np.float32(1e-6))
-    views = np.column_stack([views / distance[:, None], np.log(distance)])
-    order = np.argsort(landmark, kind="stable")
-    rank = np.zeros(len(rows), dtype=np.int32)
-    _rank_views(views, order, np.cumsum(np.bincount(landmark)), rank)
+    landmark = model.observation_landmark[rows]
+    ends = np.cumsum(np.bincount(landmark, minlength=len(model.xyz)))
+    order = np.argsort(landmark, kind="stable").astype(np.int32)
+    del landmark
+    centres = np.stack([p.translation for p in model.map_from_image])
+    rank = np.zeros(len(rows), dtype=np.uint8)
+    _rank_views(model.xyz, centres, model.observation_image, rows, order, ends, rank)
     return rank
 
 
 @numba.njit(cache=True)
-def _rank_views(views, order, ends, rank):  # type: ignore[no-untyped-def]
+def _rank_views(xyz, centres, image, rows, order, ends, rank):  # type: ignore[no-untyped-def]
     begin = 0
-    for end in ends:
+    for landmark in range(len(ends)):
+        end = ends[landmark]
         n = end - begin
         if n > 1:
-            away = np.full(n, np.inf)
+            views = np.zeros((n, 4))
             mean = np.zeros(4)
-            for k in range(begin, end):
-                for i in range(4):
-                    mean[i] += views[order[k], i] / n
-            chosen, least = 0, np.inf
             for k in range(n):
-                d = 0.0
-                for i in range(4):
-                    d += (views[order[begin + k], i] - mean[i]) ** 2
-                if d < least:
-                    chosen, least = k, d
-            for number in range(n):
-                rank[order[begin + chosen]] = number
-                away[chosen] = -1.0
-                following, most = chosen, -1.0
-                for k in range(n):
-                    if away[k] >= 0.0:
-                        d = 0.0
-                        for i in range(4):
-                            d += (views[order[begin + k], i] - views[order[begin + chosen], i]) ** 2
-                        away[k] = min(away[k], d)
-                        if away[k] > most:
-                            following, most = k, away[k]
-                chosen = following
+                i = image[rows[order[begin + k]]]
+                length = 0.0
+                for j in range(3):
+                    views[k, j] = centres[i, j] - xyz[landmark, j]
+                    length += views[k, j] ** 2
+                length = max(math.sqrt(length), 1e-6)
+                for j in range(3):
+                    views[k, j] /= length
+                views[k, 3] = math.log(length)
+                for j in range(4):
+                    mean[j] += views[k, j] / n
+            _rank_one(views, mean, order[begin:end], rank)
         begin = end
+
+
+@numba.njit(cache=True)
+def _rank_one(views, mean, members, rank):  # type: ignore[no-untyped-def]
+    n = len(views)
+    away = np.full(n, np.inf)
+    chosen, least = 0, np.inf
+    for k in range(n):
+        d = 0.0
+        for j in range(4):
+            d += (views[k, j] - mean[j]) ** 2
+        if d < least:
+            chosen, least = k, d
+    for number in range(n):
+        rank[members[chosen]] = min(number, 255)
+        away[chosen] = -1.0
+        following, most = chosen, -1.0
+        for k in range(n):
+            if away[k] >= 0.0:
+                d = 0.0
+                for j in range(4):
+                    d += (views[k, j] - views[chosen, j]) ** 2
+                away[k] = min(away[k], d)
+                if away[k] > most:
+                    following, most = k, away[k]
+        chosen = following

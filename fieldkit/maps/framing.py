@@ -14,7 +14,7 @@ from fieldkit.errors import MapError
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity, Verdict, align_to_slam
 from fieldkit.maps.known import known_alignment
-from fieldkit.maps.landmarks import model_arrays
+from fieldkit.maps.landmarks import Model, model_arrays
 from fieldkit.maps.metric import DepthScale, depth_scale, rescaled, with_depth_scale
 from fieldkit.maps.options import MapOptions, Progress
 from fieldkit.maps.order import walk_order
@@ -56,7 +56,7 @@ def refuse_unscaled(walk: MapSource, options: MapOptions) -> None:
 
 def find_frame(
     walk: MapSource,
-    model: pycolmap.Reconstruction,
+    model: pycolmap.Reconstruction | Model,
     sfm_poses: Mapping[int, Pose],
     options: MapOptions,
     *,
@@ -174,7 +174,7 @@ def _tag_doubts(tags: TagScale) -> list[str]:
 
 def _by_images(
     walk: MapSource,
-    model: pycolmap.Reconstruction,
+    model: pycolmap.Reconstruction | Model,
     sfm_poses: Mapping[int, Pose],
     tags: TagScale | None,
     told: list[str],
@@ -224,7 +224,8 @@ def _gravity_told(up: Upright) -> str:
     return f"nothing measured gravity: up is known to {up.sigma_deg:.2f} deg if {assumed}"
 
 
-def _by_known(walk: MapSource, model: pycolmap.Reconstruction, poses: Mapping[int, Pose], share: float) -> Told:
+def _by_known(walk: MapSource, model: pycolmap.Reconstruction | Model, poses: Mapping[int, Pose], share: float) -> Told:
+    assert not isinstance(model, Model)
     up = find_upright(walk, poses)
     tilt = float(np.degrees(np.arccos(np.clip(up.up_in_sfm[2], -1.0, 1.0))))
     alignment = known_alignment(model, poses, share=share, tilt=(tilt, up.sigma_deg))
@@ -241,11 +242,11 @@ def _by_known(walk: MapSource, model: pycolmap.Reconstruction, poses: Mapping[in
 
 
 def _depth_ratio(
-    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], map_from_sfm: Similarity
+    walk: MapSource, model: pycolmap.Reconstruction | Model, sfm_poses: Mapping[int, Pose], map_from_sfm: Similarity
 ) -> DepthScale | None:
     if walk.depth_camera is None:
         return None
-    camera, arrays = walk.depth_camera, model_arrays(model)
+    camera, arrays = walk.depth_camera, model if isinstance(model, Model) else model_arrays(model)
     scaled = dataclasses.replace(arrays, xyz=map_from_sfm.points(arrays.xyz))
     mapped = {i: map_from_sfm.pose(p) for i, p in sfm_poses.items()}
     return depth_scale(walk, scaled, mapped, read=lambda frame: read_depth(frame, camera))

@@ -5,22 +5,21 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import MapError
-from fieldkit.features import Features, feature_kind
+from fieldkit.features import Features, feature_name
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity, align_to_slam
+from fieldkit.maps.align import Similarity
+from fieldkit.maps.build import alignment_entry
 from fieldkit.maps.colmap import model_folder, read_model, write_model
 from fieldkit.maps.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
+from fieldkit.maps.import_frame import FrameOptions, metric_alignment
 from fieldkit.maps.io import (
-    AlignmentEntry,
     MapFile,
     SurfaceEntry,
     content_digest,
@@ -30,44 +29,37 @@ from fieldkit.maps.io import (
 )
 from fieldkit.maps.landmarks import LandmarkRules, Model, good_landmarks
 from fieldkit.maps.meshes import ForeignMesh, fit_mesh
-from fieldkit.maps.options import MapReport
-from fieldkit.maps.stamps import match_names
-from fieldkit.store import atomic_folder, read_tum, refuse_existing
+from fieldkit.maps.options import MapReport, Progress
+from fieldkit.store import atomic_folder, refuse_existing
 from fieldkit.surface import write_ply
 from fieldkit.types import Surface
-
-Progress = Callable[[str, int, int], None]
-Up = Literal["x", "y", "z", "-x", "-y", "-z"]
-_UP: dict[str, tuple[float, float, float]] = {
-    "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)
-}  # fmt: skip
-# Cameras are held upright on the whole: a median tilt beyond this means that another axis is up
-_MAX_TILT_DEG = 45.0
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportOptions:
-    """Where a model's scale, frame, descriptors and surface come from.
+    """Where a model's frame, descriptors and surface come from.
 
-    ``poses`` (TUM, z up, in m) are of its images; else ``scale`` makes its unit a metre, and ``up`` is its axis that
-    points up. ``features`` is hloc's features.h5, ``database`` COLMAP's; without either descriptors are extracted
-    from the images. Raises MapError when the scale is not positive or more than one source is given for one thing.
+    ``features`` is hloc's features.h5, ``database`` COLMAP's; without either descriptors are extracted from the images.
+    Raises MapError when the scale is not positive or more than one source is given for one thing.
     """
 
     feature: str = "sift"
-    poses: Path | None = None
-    scale: float | None = None
-    up: Up = "z"
+    frame: FrameOptions = dataclasses.field(default_factory=FrameOptions)
     features: Path | None = None
     database: Path | None = None
     mesh: ForeignMesh | None = None
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
+    weights: Path | None = None
 
     def __post_init__(self) -> None:
-        if self.scale is not None:
-            positive("scale", self.scale)
-        for first, second in (("poses", "scale"), ("features", "database")):
-            if getattr(self, first) is not None and getattr(self, second) is not None:
+        frame = self.frame
+        if frame.scale is not None:
+            positive("scale", frame.scale)
+        for first, second, given in (
+            ("poses", "scale", (frame.poses, frame.scale)),
+            ("features", "database", (self.features, self.database)),
+        ):
+            if None not in given:
                 raise MapError(f"--{first} and --{second} are both given; expected one", hint="leave one of them away")
 
 
@@ -89,13 +81,13 @@ def import_map(
     """
     options = ImportOptions() if options is None else options
     tell: Progress = progress or (lambda step, done, total: None)
-    feature_kind(options.feature)
+    options = dataclasses.replace(options, feature=feature_name(options.feature))
     refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
     seconds, start = {}, time.perf_counter()
     folder = model_folder(model_path)
     found = read_model(folder)
     _refuse_useless(folder, found, images, options)
-    alignment, warnings = metric_alignment(folder, found, options, seed=seed)
+    alignment, warnings = metric_alignment(folder, found, images, options.frame, seed=seed, progress=tell)
     model, n_points = _in_map(found, alignment.map_from_sfm), len(found.xyz)
     good = good_landmarks(model, options.landmarks)
     if not good.any():
@@ -117,7 +109,9 @@ def import_map(
     with atomic_folder(Path(out), force=force, marker="map.toml") as work:
         write_landmark_map(work, model, descriptors, surface)
         digest = content_digest(work)
-        write_map_file(work, MapFile(1, digest, options.feature, *counts, _entry(alignment), _surface_entry(surface)))
+        write_map_file(
+            work, MapFile(1, digest, options.feature, *counts, alignment_entry(alignment), _surface_entry(surface))
+        )
     seconds["write"] = time.perf_counter() - start
     return MapReport(str(out), digest, *counts, alignment, surface is not None, seconds, tuple(warnings))
 
@@ -138,44 +132,6 @@ def _refuse_useless(folder: Path, model: Model, images: Path | None, options: Im
             f"{folder}: a model has no descriptors; expected the images to extract them from, or the features",
             hint="give --images DIR, or --features features.h5 of hloc, or --database database.db of COLMAP",
         )
-
-
-def metric_alignment(folder: Path, model: Model, options: ImportOptions, *, seed: int) -> tuple[Alignment, list[str]]:
-    """Return map_from_sfm, by poses of the model's images or as the user states it, and what a user should know.
-
-    Raises MapError when neither is given, or the poses do not fit.
-    """
-    if options.poses is not None:
-        poses = match_names(read_tum(options.poses), model.image_names)
-        posed = [i for i, name in enumerate(model.image_names) if name in poses]
-        try:
-            alignment = align_to_slam(
-                [model.map_from_image[i] for i in posed], [poses[model.image_names[i]] for i in posed], seed=seed
-            )
-        except MapError as error:
-            raise MapError(f"{options.poses}: {error.message}", hint=error.hint) from error
-        if alignment.verdict == "pass":
-            return alignment, []
-        return alignment, [
-            f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} poses within "
-            f"{alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
-        ]
-    if options.scale is None:
-        raise MapError(
-            f"{folder}: its scale is unknown; expected what makes it metric and z up",
-            hint="give --poses poses.txt (TUM, of its images), or --scale 1 --up z when it is in metres with z up",
-        )
-    return _known(model, options.scale, options.up)
-
-
-def _known(model: Model, scale: float, up: Up) -> tuple[Alignment, list[str]]:
-    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [_UP[up]])
-    similarity = Similarity(scale, turn, np.zeros(3))
-    ups = np.stack([(turn * p.rotation).apply([0.0, -1.0, 0.0]) for p in model.map_from_image])
-    tilt_deg = float(np.degrees(np.arccos(np.clip(np.median(ups[:, 2]), -1.0, 1.0))))
-    verdict: Literal["pass", "warn"] = "pass" if tilt_deg < _MAX_TILT_DEG else "warn"
-    doubts = [] if verdict == "pass" else [f"the cameras' up is {tilt_deg:.0f} deg off the map's: check --up"]
-    return Alignment(similarity, "known", 0, 0, 0.0, 0.0, 0.0, 0.0, verdict), doubts
 
 
 def _in_map(model: Model, map_from_sfm: Similarity) -> Model:
@@ -207,7 +163,7 @@ def _descriptors(model: Model, images: Path | None, options: ImportOptions, tell
     if options.database is not None:
         return database_descriptors(options.database, model, feature=options.feature)
     assert images is not None
-    return image_descriptors(images, model, feature=options.feature, progress=tell)
+    return image_descriptors(images, model, feature=options.feature, progress=tell, weights=options.weights)
 
 
 def _described(model: Model, descriptors: NDArray[Any]) -> list[str]:
@@ -238,12 +194,6 @@ def write_landmark_map(folder: Path, model: Model, descriptors: NDArray[Any], su
     write_features(folder / "features.h5", features, sizes)
     if surface is not None:
         write_ply(folder / "surface.ply", surface)
-
-
-def _entry(a: Alignment) -> AlignmentEntry:
-    return AlignmentEntry(
-        a.source, a.map_from_sfm.scale, a.n_used, a.n_total, a.rms_m, a.p95_m, a.gravity_deg, a.verdict
-    )
 
 
 def _surface_entry(surface: Surface | None) -> SurfaceEntry | None:

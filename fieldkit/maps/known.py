@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose, skew
 from fieldkit.maps.align import Alignment, Similarity, Verdict
-from fieldkit.maps.landmarks import Model, model_arrays, reprojection_errors
+from fieldkit.maps.landmarks import Model, model_arrays
 from fieldkit.maps.sfm import mapping_options, quiet_colmap
 from fieldkit.maps.source import SourceImage
+from fieldkit.observations import reprojection_errors
 
 Array = NDArray[np.float64]
 
