@@ -18,6 +18,7 @@ from tyro.conf import UseAppendAction as Repeated
 from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
+from fieldkit.localize_commands import localize
 from fieldkit.map_commands import map_build, map_compact, map_export, map_import, map_info
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
 from fieldkit.tag_tables import print_second, print_tags, second_json, tags_json
@@ -103,41 +104,6 @@ def tags_calibrate(
         if not photo.used:
             logging.getLogger(__name__).warning("%s: not used: %s", photo.file, photo.reason)
     return contradicted
-
-
-def localize(
-    images: Positional[Path], *, map: Path, camera: Path, out: Path, json: bool = False, force: bool = False
-) -> None:
-    """Localize images in a map; write the poses as TUM text.
-
-    Args:
-        images: image file or folder of images
-        map: map folder
-        camera: camera.toml
-        out: poses.txt to write; a failed image has no line
-        json: print JSON with status, inliers, covariance and seconds per image
-        force: replace an existing file
-    """
-    from fieldkit import maps, store
-    from fieldkit.localize import Localizer
-    from fieldkit.localize.files import localize_files
-
-    store.refuse_existing(out, force=force, kind="file")
-    calibration = store.read_camera(camera)
-    localizer = Localizer(maps.load_map(map))
-    with ProgressBars() as progress:
-        found = localize_files(localizer, images, calibration, progress=progress)
-    store.write_tum(out, [(n.replace(" ", "_"), e.map_from_cam) for n, e in found if e.map_from_cam is not None])
-    failed = [f"{n} ({e.status})" for n, e in found if e.map_from_cam is None]
-    if failed:
-        logging.getLogger(__name__).warning("%d of %d images failed: %s", len(failed), len(found), ", ".join(failed))
-    if json:
-        print_json({"version": 1, "images": [{"name": n, **_estimate_json(e)} for n, e in found]})
-        return
-    table = make_table("image", "status", "matches", "inliers", "seconds")
-    for name, e in found:
-        table.add_row(*cells([name, e.status, e.n_matches, e.n_inliers, f"{sum(e.seconds.values()):.2f}"]))
-    Console().print(table)
 
 
 def replay(
@@ -369,20 +335,6 @@ def _missed_bounds(run: Any) -> int:
     for miss in misses:
         logging.getLogger(__name__).error("%s: %s", run.path or run.protocol.name, miss)
     return 3 if misses else 0
-
-
-def _estimate_json(estimate: Any) -> dict[str, Any]:
-    found = estimate.map_from_cam
-    return {
-        "status": estimate.status,
-        "position_m": None if found is None else found.translation,
-        "quaternion_xyzw": None if found is None else found.rotation.as_quat(),
-        "matches": estimate.n_matches,
-        "inliers": estimate.n_inliers,
-        "confidence": estimate.confidence,
-        "covariance": None if estimate.covariance is None else estimate.covariance.ravel(),
-        "seconds": dict(estimate.seconds),
-    }
 
 
 if __name__ == "__main__":

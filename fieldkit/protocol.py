@@ -153,6 +153,14 @@ def from_dict(values: dict[str, Any], *, source: str) -> Protocol:
     return protocol
 
 
+def localizer_rules(**values: Any) -> LocalizerRules:
+    """Make rules of the localizer from options of a command; raises ProtocolError for a value out of range."""
+    try:
+        return msgspec.convert(values, LocalizerRules)
+    except msgspec.ValidationError as error:
+        raise ProtocolError(f"localizer: {error}", hint="correct the option") from error
+
+
 def to_dict(protocol: Protocol) -> dict[str, Any]:
     """Return plain values that `from_dict` reads back."""
     values: dict[str, Any] = msgspec.to_builtins(protocol)
