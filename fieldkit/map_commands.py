@@ -37,8 +37,8 @@ def map_build(
     Args:
         source: mapping folder (rig.toml) or image folder (images/, camera.toml, poses.txt, depth/)
         out: map folder to write
-        feature: local feature of landmarks: sift, sift_l2, akaze, aliked, xfeat, superpoint
-        matcher: how pairs of mapping images are matched: nearest neighbours, or lightglue (aliked only, slow)
+        feature: local feature of landmarks: sift, sift_l2, akaze, aliked, aliked_n16, aliked_t16, xfeat, superpoint
+        matcher: how pairs of mapping images are matched: nearest neighbours, or lightglue (aliked and aliked_n16 only, slow)
         weights: folder where the weights of networks are looked for first
         poses: slam gives scale, frame and gravity; known takes the poses as they are; none does not read them
         scale: from what; auto takes tags where --size-m is given, else calibrated depth images, else SLAM

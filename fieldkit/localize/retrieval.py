@@ -31,7 +31,10 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
     """Index a map for `most_similar`; the vocabulary is trained on its own descriptors."""
     rows = image_rows(scene_map)
     vocabulary = train_vocabulary(scene_map.descriptors, seed=seed)
-    vectors = np.stack([global_descriptor(vocabulary, scene_map.descriptors[r]) for r in rows])
+    # Written in place: a list of them and its stack would take twice the memory
+    vectors = np.empty((len(rows), vocabulary.centres.size), dtype=np.float32)
+    for i, mine in enumerate(rows):
+        vectors[i] = global_descriptor(vocabulary, scene_map.descriptors[mine])
     return Index(vocabulary, vectors, rows)
 
 

@@ -24,7 +24,7 @@ from fieldkit.maps.plausible import SlamRules, plausible_pairs
 from fieldkit.maps.sfm import quiet_colmap, reconstruct, relative_poses, threads, write_verified
 from fieldkit.maps.source import MapSource
 from fieldkit.maps.stages import Stages
-from fieldkit.maps.strays import contradicting
+from fieldkit.maps.strays import folded
 from fieldkit.tags import TagDetection
 
 # A few misplaced images are left out; of more than this share the rest is bent too, and SfM starts again.
@@ -49,7 +49,10 @@ class Matched:
 
 @dataclasses.dataclass(frozen=True)
 class Placing:
-    """A model with its poses sfm_from_cam, its alignment, and how many images are not where SLAM saw them."""
+    """A model with its poses sfm_from_cam, its alignment, and how many images are not where SLAM saw them.
+
+    Those where SLAM is what leaps do not count.
+    """
 
     model: pycolmap.Reconstruction
     sfm_poses: Mapping[int, Pose]
@@ -115,7 +118,7 @@ def place_once(
     with stages.timed("align"):
         alignment, warnings = find_frame(walk, model, poses, options, tags=found.tags, seed=seed, match_share=share)
         mapped = {i: alignment.map_from_sfm.pose(p) for i, p in poses.items()}
-        far = contradicting(walk.images, mapped, threshold_m=alignment.threshold_m)
+        far = folded(walk.images, mapped, threshold_m=alignment.threshold_m)
     return Placing(model, poses, alignment, (*pieces, *warnings), len(far))
 
 
