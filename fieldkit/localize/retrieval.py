@@ -44,11 +44,11 @@ def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
     landmarks, positions = np.unique(scene_map.descriptor_landmark, return_index=True)
     first[landmarks] = positions
     count = len(scene_map.image_names)
-    seen = _grouped(scene_map.observation_image, count)
+    bounds = np.searchsorted(scene_map.observation_image, np.arange(count + 1))
     own = _grouped(scene_map.descriptor_image, count)
     result = []
     for i in range(count):
-        chosen = first[np.unique(scene_map.observation_landmark[seen[i]])]
+        chosen = first[np.unique(scene_map.observation_landmark[bounds[i] : bounds[i + 1]])]
         borrowed = chosen[chosen >= 0]
         described = scene_map.descriptor_landmark[own[i]]
         borrowed = borrowed[~np.isin(scene_map.descriptor_landmark[borrowed], described)]

@@ -16,7 +16,7 @@ from fieldkit.errors import MapError, suggestion
 from fieldkit.features import FEATURES, Features
 from fieldkit.maps import whole
 from fieldkit.maps.colmap import read_model
-from fieldkit.maps.descriptors import read_landmark_descriptors
+from fieldkit.maps.descriptors import MAX_BYTES, read_landmark_descriptors
 from fieldkit.maps.landmarks import landmark_covariance
 from fieldkit.maps.record import read_record
 from fieldkit.store import digest, read_toml, write_toml
@@ -152,14 +152,15 @@ def load_map(path: Path) -> SceneMap:
     descriptors, rows = read_landmark_descriptors(path / "features.h5", model, width=width)
     every = len(rows) == len(model.observation_landmark)
     retrieval, vectors = whole.read_global(path / whole.FILE, model.image_names) or (None, None)
+    covariance = landmark_covariance(
+        model.xyz, model.observation_landmark, model.observation_image, model.map_from_image, model.image_cameras
+    )
     return SceneMap(
         path=str(path),
         digest=entry.digest,
         feature=entry.feature,
         xyz=model.xyz,
-        xyz_covariance=landmark_covariance(
-            model.xyz, model.observation_landmark, model.observation_image, model.map_from_image, model.image_cameras
-        ),
+        xyz_covariance=covariance if descriptors.nbytes < MAX_BYTES // 2 else covariance.astype(np.float32),
         image_names=model.image_names,
         image_cameras=model.image_cameras,
         map_from_image=model.map_from_image,

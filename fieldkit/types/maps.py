@@ -26,7 +26,7 @@ class Surface:
 class SceneMap:
     """Landmarks in the metric, gravity aligned map frame, who saw them from where, and their descriptors.
 
-    Landmarks (n): ``xyz`` f64[n, 3] in m; ``xyz_covariance`` f64[n, 3, 3] in m^2.
+    Landmarks (n): ``xyz`` f64[n, 3] in m; ``xyz_covariance`` f64[n, 3, 3] in m^2, f32 in large maps.
     Mapping images (k): ``image_names``, ``image_cameras``, ``map_from_image`` poses (camera in the map).
     Observations (o), sorted by image: ``observation_landmark`` int32[o], ``observation_image`` int32[o],
     ``observation_px`` f32[o, 2].
@@ -40,7 +40,7 @@ class SceneMap:
     digest: str
     feature: str
     xyz: Array
-    xyz_covariance: Array
+    xyz_covariance: Array | NDArray[np.float32]
     image_names: tuple[str, ...]
     image_cameras: tuple[Camera, ...]
     map_from_image: tuple[Pose, ...]
