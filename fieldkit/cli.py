@@ -50,6 +50,7 @@ def tags_calibrate(
     check_map: Path | None = None,
     family: Repeated[tuple[str, ...]] = (),
     detector: Literal["pupil", "opencv"] | None = None,
+    weights: Path | None = None,
     json: bool = False,
     force: bool = False,
 ) -> int:
@@ -64,11 +65,13 @@ def tags_calibrate(
         check_map: another map of the place, such as one of another feature: compare where it localizes the photos
         family: tag family, by default tag36h11; may be repeated
         detector: what finds the tags; by default pupil, and opencv for tag36h10
+        weights: folder where the weights of networks are looked for first
         json: print JSON
         force: replace an existing file
     """
     from fieldkit import store
     from fieldkit.calibrate import calibrate_photos, check_in_second_map, parse_sizes, refuse_same_map
+    from fieldkit.features.weights import weights_first_in
     from fieldkit.maps import load_map
 
     store.refuse_existing(out, force=force, kind="file")
@@ -77,7 +80,7 @@ def tags_calibrate(
     other = None if check_map is None else load_map(check_map)
     if other is not None:
         refuse_same_map(scene_map, other)
-    with ProgressBars() as progress:
+    with ProgressBars() as progress, weights_first_in(weights):
         tags = calibrate_photos(
             photos, scene_map, camera=camera, sizes_m=sizes_m, families=families, detector=detector, progress=progress
         )
@@ -115,6 +118,7 @@ def replay(
     camera: Path | None = None,
     hand: Path | None = None,
     protocol: str = "paper_real",
+    weights: Path | None = None,
     force: bool = False,
 ) -> int:
     """Replay recordings through every policy of a protocol; print the recall table, exit with 3 on a missed bound.
@@ -127,16 +131,18 @@ def replay(
         camera: camera.toml to use in place of what the recordings state, as of `tags check --refine-camera`
         hand: hand.toml to use in place of what the recordings state, as of `tags check --refine-hand`
         protocol: name of a protocol, or a .toml file
+        weights: folder where the weights of networks are looked for first
         force: replace an existing run
     """
     from fieldkit import protocol as protocols
+    from fieldkit.features.weights import weights_first_in
     from fieldkit.store import is_dataset
 
     rules = protocols.load(protocol)
     sets = [r for r in recordings if is_dataset(r)]
     theirs = {"--map": map, "--tags": tags, "--camera": camera, "--hand": hand}
     _refuse_mixture(recordings, sets, {name: path for name, path in theirs.items() if path is not None})
-    with ProgressBars() as progress:
+    with ProgressBars() as progress, weights_first_in(weights):
         if sets:
             from fieldkit.dataset import replay_datasets
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from fieldkit.features.matchers import open_matcher
 from fieldkit.features.matching import match_pair
 from fieldkit.features.superpoint import local_maxima, maps, superpoint_network
 from fieldkit.features.weights import WEIGHTS
+from fieldkit.maps.pairs import match_pairs
 
 PHOTO = Path(__file__).parents[1] / "docs" / "room.jpg"
 
@@ -148,6 +150,20 @@ def test_lightglue_matches_a_warped_image_and_needs_a_feature_that_it_knows() ->
     assert len(network.match(a, (320, 224), none, (64, 64))[0]) == 0
     with pytest.raises(FeatureError, match="no LightGlue for feature 'sift'; expected one of: aliked"):
         open_matcher("sift", "lightglue")
+
+
+@pytest.mark.parametrize("name", ["nearest", "lightglue"])
+def test_pairs_are_matched_alike_by_any_number_of_threads(name: Literal["nearest", "lightglue"]) -> None:
+    images = [photo(), photo()[:192, :256], photo()[32:, 64:]]
+    features = [opened("aliked").extract(np.ascontiguousarray(image)) for image in images]
+    sizes = [(image.shape[1], image.shape[0]) for image in images]
+    pairs, matcher = [(0, 1), (0, 2), (1, 2)], open_matcher("aliked", name)
+    one, two = (match_pairs(pairs, features, sizes=sizes, matcher=matcher, n_threads=n) for n in (1, 2))
+    for first, second in zip(one, two, strict=True):
+        np.testing.assert_array_equal(first, second)
+    shown = features[0].keypoints_px[one[1][:, 0]] - features[2].keypoints_px[one[1][:, 1]]
+    assert len(shown) > 50
+    assert (np.abs(shown - np.array([64.0, 32.0])) < 1.0).all(axis=1).mean() > 0.9
 
 
 def stored_superpoint(folder: Path, **changes: torch.Tensor | None) -> dict[str, torch.Tensor]:

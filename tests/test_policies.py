@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
@@ -276,3 +277,10 @@ def test_no_policy_is_given_images_estimates_or_truth() -> None:
         "candidates", "visible", "statistics",
         "visit", "view_ids", "kinds", "map_from_cam", "camera", "allowed", "forward_in_map",
     }  # fmt: skip
+
+
+def test_another_name_of_a_map_s_feature_is_that_feature(scene_map: SceneMap) -> None:
+    rules = Protocol("mine", (Threshold(0.1, 1.0),), ("forward",))
+    policies.check_map(scene_map, msgspec.structs.replace(rules, feature="rootsift"))
+    with pytest.raises(PolicyError, match="made with feature 'sift'; the protocol mine expects 'aliked'"):
+        policies.check_map(scene_map, msgspec.structs.replace(rules, feature="aliked"))

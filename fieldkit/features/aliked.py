@@ -70,27 +70,27 @@ def _maps(network: ALIKED, image: torch.Tensor) -> tuple[torch.Tensor, torch.Ten
     no multiple of 32 are continued at the right and bottom by their last pixels.
     """
     import torch
-    from torch.nn import functional
+    from torch.nn.functional import pad
 
     height, width = image.shape[-2:]
-    padded = functional.pad(image, (0, -width % _SIDE_PX, 0, -height % _SIDE_PX), mode="replicate")
+    padded = pad(image, (0, -width % _SIDE_PX, 0, -height % _SIDE_PX), mode="replicate")
     first = network.block1(padded)
     second = network.block2(network.pool2(first))
     third = network.block3(network.pool4(second))
     fourth = network.block4(network.pool4(third))
 
-    def narrow(layer: torch.nn.Module, x: torch.Tensor) -> torch.Tensor:
-        return torch.as_tensor(network.gate(layer(x))).contiguous(memory_format=torch.channels_last)
-
-    joined = torch.cat(
-        [
-            narrow(network.conv1, first),
-            network.upsample2(narrow(network.conv2, second)),
-            network.upsample8(narrow(network.conv3, third)),
-            network.upsample32(narrow(network.conv4, fourth)),
-        ],
-        dim=1,
-    )
+    # One after the other: a photo of 1600x1200 would need 2 GB for them and what they are joined to.
+    joined = torch.empty((1, WIDTH, *padded.shape[-2:]), memory_format=torch.channels_last)
+    for number, (layer, upsample, x) in enumerate(
+        (
+            (network.conv1, torch.nn.Identity(), first),
+            (network.conv2, network.upsample2, second),
+            (network.conv3, network.upsample8, third),
+            (network.conv4, network.upsample32, fourth),
+        )
+    ):
+        narrow = network.gate(layer(x)).contiguous(memory_format=torch.channels_last)
+        joined[:, number * WIDTH // 4 : (number + 1) * WIDTH // 4] = upsample(narrow)
     scores = torch.sigmoid(network.score_head(joined))
-    features = functional.normalize(joined, dim=1)
-    return features[..., :height, :width], scores[..., :height, :width].contiguous()
+    joined /= torch.linalg.vector_norm(joined, dim=1, keepdim=True).clamp_min(1e-12)
+    return joined[..., :height, :width], scores[..., :height, :width].contiguous()

