@@ -26,6 +26,8 @@ _UNDECIDED = 5.0
 # Residuals of this many standard deviations have half of the weight: 95 % as good as least squares on Gaussian ones
 _SCALE = 3.0
 _ITERATIONS = 20
+# Share of the variance that matches in one cell have in common: they lie on the same edges, lit and blurred alike
+_SHARED, _CELL_PX = 0.5, 16.0
 # Median of chi-square with 2 degrees of freedom
 _MEDIAN_CHI2 = 2.0 * math.log(2.0)
 # Shares of the inlier bound at which RANSAC is started. Distant, nearly planar landmarks have two poses that agree
@@ -167,9 +169,20 @@ def refine_pose(
     slope = (1.0 + squared / scale**2) ** -2
     variance = (0.5 * slope @ squared + EXPECTED_MATCHES) / (max(slope.sum() - 3.0, 0.0) + EXPECTED_MATCHES)
     weighted = slope[:, None, None] * by_pose
-    inverse = np.linalg.pinv(np.einsum("nai,naj->ij", weighted, by_pose), hermitian=True)
+    alone = np.einsum("nai,naj->ij", weighted, by_pose)
+    inverse = np.linalg.pinv(alone, hermitian=True)
     response = -np.einsum("ij,njk->ink", inverse, np.einsum("naj,nak->njk", weighted, by_landmark))
-    return refined, 0.5 * variance * (inverse + inverse.T), response.reshape(6, -1)
+    spread = inverse @ ((1.0 - _SHARED) * alone + _SHARED * _crowded(stacked, weighted)) @ inverse
+    return refined, 0.5 * variance * (spread + spread.T), response.reshape(6, -1)
+
+
+def _crowded(stacked: _Stacked, weighted: Array) -> Array:
+    """Return the information (6, 6) that matches would have whose errors are the same in every cell of the image."""
+    cells = np.column_stack([stacked.camera, np.floor(stacked.pixels / _CELL_PX).astype(np.int64)])
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    sums = np.zeros((int(cell.max(initial=-1)) + 1, 2, 6))
+    np.add.at(sums, cell.ravel(), weighted)
+    return np.asarray(np.einsum("cai,caj->ij", sums, sums))
 
 
 def shown_noise(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:

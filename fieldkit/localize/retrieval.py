@@ -1,4 +1,4 @@
-"""Which mapping images look like the query: global descriptors made of the map's own landmark descriptors."""
+"""Which mapping images look like the query: by descriptors of the map's own landmarks, or by a network's of images."""
 
 from __future__ import annotations
 
@@ -61,8 +61,20 @@ def most_similar(index: Index, descriptors: Descriptors, *, count: int, among: N
 
     Only those in ``among`` bool[k], where it is given.
     """
+    vector = global_descriptor(index.vocabulary, descriptors)
+    return nearest_vectors(index.vectors, vector, count=count, among=among)
+
+
+def nearest_vectors(
+    vectors: NDArray[np.float32],
+    vector: NDArray[np.float32],
+    *,
+    count: int,
+    among: NDArray[np.bool_] | None = None,
+) -> Ints:
+    """Return the indices of the unit vectors f32[k, w] nearest to one f32[w], best first, as `most_similar` does."""
     # Summed by numpy itself: BLAS would start threads for it
-    similarity = np.einsum("kw,w->k", index.vectors, global_descriptor(index.vocabulary, descriptors))
+    similarity = np.einsum("kw,w->k", vectors, vector)
     order = np.argsort(-similarity, kind="stable")
     return (order if among is None else order[among[order]])[:count].astype(np.int32)
 

@@ -32,6 +32,8 @@ class SceneMap:
     ``observation_px`` f32[o, 2].
     Descriptors (d): ``descriptors`` uint8 or float32[d, width], ``descriptor_landmark`` int32[d],
     ``descriptor_image`` int32[d]; a compact map has one per landmark.
+    ``retrieval``: the network that made ``image_vectors`` f32[k, w], unit vectors of whole mapping images; None where
+    images are compared by their landmarks' descriptors.
     """
 
     path: str
@@ -49,6 +51,8 @@ class SceneMap:
     descriptor_landmark: NDArray[np.int32]
     descriptor_image: NDArray[np.int32]
     surface: Surface | None = None
+    retrieval: str | None = None
+    image_vectors: NDArray[np.float32] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
