@@ -30,6 +30,7 @@ from fieldkit.maps.io import (
 from fieldkit.maps.landmarks import LandmarkRules, Model, good_landmarks
 from fieldkit.maps.meshes import ForeignMesh, fit_mesh
 from fieldkit.maps.options import MapOptions, MapReport, Progress
+from fieldkit.maps.source import MapSource
 from fieldkit.store import atomic_folder, refuse_existing
 from fieldkit.surface import write_ply
 from fieldkit.types import Surface
@@ -98,15 +99,7 @@ def import_map(
     model, n_points = _in_map(found, alignment.map_from_sfm), len(found.xyz)
     if options.retriangulate:
         assert images is not None
-        rebuilt = build_map(
-            posed_walk(folder, model, images),
-            out,
-            feature=options.feature,
-            force=force,
-            options=MapOptions(poses="known", weights=options.weights, landmarks=options.landmarks),
-            seed=seed,
-            progress=progress,
-        )
+        rebuilt = _rebuilt(posed_walk(folder, model, images), out, options, force=force, seed=seed, progress=tell)
         return dataclasses.replace(rebuilt, warnings=(*warnings, *rebuilt.warnings))
     good = good_landmarks(model, options.landmarks)
     if not good.any():
@@ -133,6 +126,14 @@ def import_map(
         )
     seconds["write"] = time.perf_counter() - start
     return MapReport(str(out), digest, *counts, alignment, surface is not None, seconds, tuple(warnings))
+
+
+def _rebuilt(
+    walk: MapSource, out: Path, options: ImportOptions, *, force: bool, seed: int, progress: Progress
+) -> MapReport:
+    """Find landmarks anew from images whose poses are the model's."""
+    building = MapOptions(poses="known", weights=options.weights, landmarks=options.landmarks)
+    return build_map(walk, out, feature=options.feature, force=force, options=building, seed=seed, progress=progress)
 
 
 def _refuse_useless(folder: Path, model: Model, images: Path | None, options: ImportOptions) -> None:
