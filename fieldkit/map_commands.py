@@ -91,6 +91,7 @@ def map_import(
     mesh_up: Literal["y", "z"] = "z",
     mesh_voxel_m: float | None = None,
     min_images: int = 4,
+    retriangulate: bool = False,
     force: bool = False,
 ) -> None:
     """Make a map of a COLMAP or hloc model: metric frame, landmarks with descriptors, and a mesh as surface.
@@ -116,6 +117,7 @@ def map_import(
         mesh_up: axis of the mesh that points up
         mesh_voxel_m: resolution of the mesh; by default its median edge, within 0.01..0.10 m
         min_images: images that have to see a point to make it a landmark
+        retriangulate: keep the model's cameras and poses only, and find landmarks by --feature anew
         force: replace an existing map
     """
     from fieldkit import maps
@@ -125,7 +127,7 @@ def map_import(
     sizes_m = parse_sizes(size_m) if size_m else {}
     frame = maps.FrameOptions(poses, scale, up, sizes_m, family or ("tag36h11",), depth, depth_camera)
     rules = maps.LandmarkRules(min_images=min_images)
-    options = maps.ImportOptions(feature, frame, features, database, meshed, rules, weights)
+    options = maps.ImportOptions(feature, frame, features, database, meshed, rules, weights, retriangulate)
     with ProgressBars() as progress:
         built = maps.import_map(model, out, images=images, options=options, force=force, progress=progress)
     for warning in built.warnings:

@@ -16,7 +16,16 @@ from tiny_walk import TAG_M, write_walk
 
 from fieldkit.errors import MapError, TagError
 from fieldkit.frames import Pose, exp, pose_error
-from fieldkit.maps import MapOptions, build_map, fit_gauge, load_map, map_info
+from fieldkit.maps import (
+    FrameOptions,
+    ImportOptions,
+    MapOptions,
+    build_map,
+    fit_gauge,
+    import_map,
+    load_map,
+    map_info,
+)
 from fieldkit.maps.tagged import TagScale, tag_scale
 from fieldkit.maps.upright import level_cameras, up_rotation
 from fieldkit.store import write_tum
@@ -87,6 +96,20 @@ def test_known_poses_stay_as_they_are(room: tuple[Path, Mapping[str, Pose]], tmp
     assert len(scene_map.xyz) > 200
     walls = np.abs(scene_map.xyz[:, :2]) / (2.0, 1.6)
     assert np.median(np.abs(walls.max(axis=1) - 1.0)) < 0.01
+
+
+def test_an_imported_model_is_triangulated_anew_by_another_feature(
+    room: tuple[Path, Mapping[str, Pose]], tmp_path: Path
+) -> None:
+    source, true = room
+    build_map(source, tmp_path / "m", options=dataclasses.replace(QUICK, poses="known"))
+    options = ImportOptions("akaze", FrameOptions(scale=1.0), retriangulate=True)
+    report = import_map(tmp_path / "m", tmp_path / "again", images=source / "images", options=options)
+    scene_map = load_map(tmp_path / "again")
+    assert scene_map.feature == "akaze"
+    assert report.n_landmarks == len(scene_map.xyz) > 100
+    for name, pose in zip(scene_map.image_names, scene_map.map_from_image, strict=True):
+        assert max(pose_error(pose, true[name])) < 1e-6
 
 
 @pytest.mark.parametrize(("sigma_rad", "sigma_m"), [(0.01, 0.01), (0.05, 0.3)])

@@ -54,7 +54,7 @@ _SHARE = 500
 
 
 def build_map(
-    source: Path,
+    source: Path | MapSource,
     out: Path,
     *,
     feature: str = "sift",
@@ -76,7 +76,7 @@ def build_map(
     tell: Progress = progress or (lambda step, done, total: None)
     feature = feature_name(feature)
     refuse_existing(out, force=force, marker="map.toml", kind="folder")
-    walk = open_source(Path(source))
+    walk = source if isinstance(source, MapSource) else open_source(Path(source))
     refuse_unscaled(walk, options)
     check_images(walk)
     extractor = open_extractor(
