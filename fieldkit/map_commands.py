@@ -62,8 +62,12 @@ def map_build(
         tag_families=family or ("tag36h11",),
         voxel_m=voxel_m,
     )
-    with ProgressBars() as progress:
-        built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
+    try:
+        with ProgressBars() as progress:
+            built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
+    except KeyboardInterrupt:
+        _log.warning("%s: interrupted; the same command goes on where it stopped", out)
+        raise
     for warning in built.warnings:
         _log.warning("%s: %s", source, warning)
     print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")

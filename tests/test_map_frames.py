@@ -7,12 +7,13 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_map import CAMERA, looking
 from test_align import ROTATION, as_sfm, walk
-from tiny_walk import TAG_M, write_walk
+from tiny_walk import TAG_M, view, write_walk
 
 from fieldkit.errors import MapError, TagError
 from fieldkit.frames import Pose, exp, pose_error
@@ -28,7 +29,7 @@ from fieldkit.maps import (
 )
 from fieldkit.maps.tagged import TagScale, tag_scale
 from fieldkit.maps.upright import level_cameras, up_rotation
-from fieldkit.store import write_tum
+from fieldkit.store import Rig, RigCamera, read_camera, write_rig, write_tum
 from fieldkit.tags import TagDetection, tag_corners
 
 QUICK = MapOptions(max_keypoints=700)
@@ -110,6 +111,31 @@ def test_an_imported_model_is_triangulated_anew_by_another_feature(
     assert report.n_landmarks == len(scene_map.xyz) > 100
     for name, pose in zip(scene_map.image_names, scene_map.map_from_image, strict=True):
         assert max(pose_error(pose, true[name])) < 1e-6
+
+
+def test_the_frames_of_a_rig_stay_where_their_known_poses_are(
+    room: tuple[Path, Mapping[str, Pose]], tmp_path: Path
+) -> None:
+    source, true = room
+    ahead, beside = Pose.identity(), exp([0.0, 0.3, 0.0, 0.1, 0.0, 0.0])
+    camera = read_camera(source / "camera.toml")
+    write_rig(tmp_path / "rig.toml", Rig((RigCamera("a", camera, ahead), RigCamera("b", camera, beside))))
+    frames = sorted(true)[::2]
+    for name, at in (("a", ahead), ("b", beside)):
+        (tmp_path / "images" / name).mkdir(parents=True)
+        for frame in frames:
+            image = view(true[frame] * at)
+            assert cv2.imwrite(str(tmp_path / "images" / name / frame), image)
+    write_tum(tmp_path / "slam_poses.txt", [(Path(frame).stem, true[frame]) for frame in frames])
+    options = dataclasses.replace(QUICK, poses="known")
+    report = build_map(tmp_path, tmp_path / "rig.map", options=options)
+    scene_map = load_map(tmp_path / "rig.map")
+    for name, pose in zip(scene_map.image_names, scene_map.map_from_image, strict=True):
+        expected = true[Path(name).name] * (beside if name.startswith("b/") else ahead)
+        assert max(pose_error(pose, expected)) < 1e-6
+    assert len(scene_map.image_names) == 16
+    assert report.alignment.match_share is not None
+    assert report.alignment.match_share > 0.85
 
 
 @pytest.mark.parametrize(("sigma_rad", "sigma_m"), [(0.01, 0.01), (0.05, 0.3)])

@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+import fieldkit
 from fieldkit.errors import MapError, SurfaceError
 from fieldkit.features import Extractor, Features, feature_name, open_extractor
 from fieldkit.features.appearance import Appearance, open_appearance
@@ -86,7 +87,7 @@ def build_map(
     appearance = None if options.retrieval == "own" else open_appearance(options.retrieval, weights=options.weights)
     walk = without_poses(walk) if options.poses == "none" else walk
     versions = library_versions()
-    key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
+    key = digest(feature, repr(options), repr((seed, versions)), *_program(), *content(walk))
     with resumed(out, key) as stages:
         with stages.timed("tags") if options.tag_sizes_m else contextlib.nullcontext():
             tags = look_for_tags(walk, options, progress=tell)
@@ -113,6 +114,11 @@ def build_map(
             if options.keep_record:
                 write_record(folder, dict(stages.seconds), versions=versions, options=repr(options), told=told)
     return MapReport(str(out), made, *counts, alignment, surface is not None, dict(stages.seconds), told)
+
+
+def _program() -> list[Path]:
+    """Return fieldkit's own files: its version alone does not tell one state of a checkout from the next."""
+    return sorted(Path(fieldkit.__file__).parent.rglob("*.py"))
 
 
 def _extract_all(
