@@ -59,6 +59,11 @@ def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors) -> Float
     return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12), dtype=np.float32)
 
 
+def nearest_words(vocabulary: Vocabulary, descriptors: Descriptors) -> Ints:
+    """Return int32[n]: the word (row of the vocabulary) of each descriptor (n, w)."""
+    return _assign(_unit(descriptors), vocabulary.centres)
+
+
 def _unit(descriptors: Descriptors) -> Floats:
     values = np.asarray(descriptors, dtype=np.float32)
     return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12), dtype=np.float32)

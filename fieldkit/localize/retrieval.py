@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
-from fieldkit.features.vlad import Vocabulary, global_descriptor, train_vocabulary
+from fieldkit.features.nearest import nearest
+from fieldkit.features.vlad import Vocabulary, global_descriptor, nearest_words, train_vocabulary
 from fieldkit.types import SceneMap
 
 Ints = NDArray[np.int32]
+# A landmark of the query's word votes when its descriptor is this much nearer than any other's
+_VOTING_RATIO = 0.85
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,11 +23,20 @@ class Index:
 
     In a full map these are the image's own descriptors. In a compact map, where a landmark keeps one descriptor,
     they are those of the landmarks that the image observes.
+
+    ``probe`` holds one descriptor of every landmark, word by word of the vocabulary, those of word i in
+    ``bounds[i]:bounds[i + 1]``, and ``probed`` whose it is; landmark i is seen by the images
+    ``seen[starts[i]:starts[i + 1]]``.
     """
 
     vocabulary: Vocabulary
     vectors: NDArray[np.float32]
     rows: tuple[Ints, ...]
+    probe: Descriptors
+    probed: Ints
+    bounds: NDArray[np.int64]
+    seen: Ints
+    starts: NDArray[np.int64]
 
 
 def build_index(scene_map: SceneMap, *, seed: int) -> Index:
@@ -32,7 +44,20 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
     rows = image_rows(scene_map)
     vocabulary = train_vocabulary(scene_map.descriptors, seed=seed)
     vectors = np.stack([global_descriptor(vocabulary, scene_map.descriptors[r]) for r in rows])
-    return Index(vocabulary, vectors, rows)
+    landmarks, first = np.unique(scene_map.descriptor_landmark, return_index=True)
+    word = nearest_words(vocabulary, scene_map.descriptors[first])
+    order = np.argsort(word, kind="stable")
+    by_landmark = np.argsort(scene_map.observation_landmark, kind="stable")
+    return Index(
+        vocabulary,
+        vectors,
+        rows,
+        scene_map.descriptors[first[order]],
+        landmarks[order].astype(np.int32),
+        np.searchsorted(word[order], np.arange(len(vocabulary.centres) + 1)),
+        scene_map.observation_image[by_landmark],
+        np.searchsorted(scene_map.observation_landmark[by_landmark], np.arange(len(scene_map.xyz) + 1)),
+    )
 
 
 def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
@@ -60,8 +85,33 @@ def most_similar(index: Index, descriptors: Descriptors, *, count: int, among: N
     """
     # Summed by numpy itself: BLAS would start threads for it
     similarity = np.einsum("kw,w->k", index.vectors, global_descriptor(index.vocabulary, descriptors))
-    order = np.argsort(-similarity, kind="stable")
+    votes = _votes(index, descriptors)
+    by_likeness, by_votes = (np.argsort(-v, kind="stable") for v in (similarity, votes))
+    # In turns: either finds places that the other does not
+    both = np.column_stack([by_votes, by_likeness]).ravel()
+    _, first = np.unique(both, return_index=True)
+    order = both[np.sort(first)]
     return (order if among is None else order[among[order]])[:count].astype(np.int32)
+
+
+def _votes(index: Index, descriptors: Descriptors) -> NDArray[np.float64]:
+    """Return f64[k]: how many of the landmarks that an image saw are the nearest to a descriptor of the query.
+
+    Only landmarks of the same word are compared, and those count that are clearly nearer than any other.
+    """
+    word = nearest_words(index.vocabulary, descriptors)
+    voted = []
+    for w in np.unique(word):
+        stored = slice(index.bounds[w], index.bounds[w + 1])
+        query = np.flatnonzero(word == w)
+        found = nearest(descriptors[query], index.probe[stored], index.probed[stored])
+        good = found.squared < _VOTING_RATIO**2 * found.other
+        voted.append(index.probed[stored][found.index[good]])
+    landmark = np.unique(np.concatenate(voted)) if voted else np.zeros(0, dtype=np.int32)
+    counts = index.starts[landmark + 1] - index.starts[landmark]
+    before = np.cumsum(counts) - counts
+    rows = np.repeat(index.starts[landmark] - before, counts) + np.arange(counts.sum())
+    return np.bincount(index.seen[rows], minlength=len(index.vectors)).astype(np.float64)
 
 
 def _grouped(owner: Ints, count: int) -> list[NDArray[np.int64]]:
