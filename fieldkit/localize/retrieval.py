@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
 from fieldkit.features.nearest import nearest
-from fieldkit.features.vlad import Vocabulary, global_descriptor, nearest_words, train_vocabulary
+from fieldkit.features.vlad import Vocabulary, global_descriptor, nearest_words, train_vocabulary, two_words
 from fieldkit.types import SceneMap
 
 Ints = NDArray[np.int32]
@@ -24,16 +24,17 @@ class Index:
     In a full map these are the image's own descriptors. In a compact map, where a landmark keeps one descriptor,
     they are those of the landmarks that the image observes.
 
-    ``probe`` holds one descriptor of every landmark, word by word of the vocabulary, those of word i in
-    ``bounds[i]:bounds[i + 1]``, and ``probed`` whose it is; landmark i is seen by the images
+    ``probe`` is one row of ``descriptors`` for every landmark, word by word of the vocabulary, those of word i in
+    ``bounds[i]:bounds[i + 1]``; ``owner`` is whose landmark a descriptor is. Landmark i is seen by the images
     ``seen[starts[i]:starts[i + 1]]``.
     """
 
     vocabulary: Vocabulary
     vectors: NDArray[np.float32]
     rows: tuple[Ints, ...]
-    probe: Descriptors
-    probed: Ints
+    descriptors: Descriptors
+    owner: Ints
+    probe: NDArray[np.int64]
     bounds: NDArray[np.int64]
     seen: Ints
     starts: NDArray[np.int64]
@@ -44,7 +45,7 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
     rows = image_rows(scene_map)
     vocabulary = train_vocabulary(scene_map.descriptors, seed=seed)
     vectors = np.stack([global_descriptor(vocabulary, scene_map.descriptors[r]) for r in rows])
-    landmarks, first = np.unique(scene_map.descriptor_landmark, return_index=True)
+    _, first = np.unique(scene_map.descriptor_landmark, return_index=True)
     word = nearest_words(vocabulary, scene_map.descriptors[first])
     order = np.argsort(word, kind="stable")
     by_landmark = np.argsort(scene_map.observation_landmark, kind="stable")
@@ -52,8 +53,9 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
         vocabulary,
         vectors,
         rows,
-        scene_map.descriptors[first[order]],
-        landmarks[order].astype(np.int32),
+        scene_map.descriptors,
+        scene_map.descriptor_landmark,
+        first[order],
         np.searchsorted(word[order], np.arange(len(vocabulary.centres) + 1)),
         scene_map.observation_image[by_landmark],
         np.searchsorted(scene_map.observation_landmark[by_landmark], np.arange(len(scene_map.xyz) + 1)),
@@ -97,17 +99,25 @@ def most_similar(index: Index, descriptors: Descriptors, *, count: int, among: N
 def _votes(index: Index, descriptors: Descriptors) -> NDArray[np.float64]:
     """Return f64[k]: how many of the landmarks that an image saw are the nearest to a descriptor of the query.
 
-    Only landmarks of the same word are compared, and those count that are clearly nearer than any other.
+    Only landmarks of its two nearest words are compared, and those count that are clearly nearer than any other.
     """
-    word = nearest_words(index.vocabulary, descriptors)
-    voted = []
-    for w in np.unique(word):
-        stored = slice(index.bounds[w], index.bounds[w + 1])
-        query = np.flatnonzero(word == w)
-        found = nearest(descriptors[query], index.probe[stored], index.probed[stored])
-        good = found.squared < _VOTING_RATIO**2 * found.other
-        voted.append(index.probed[stored][found.index[good]])
-    landmark = np.unique(np.concatenate(voted)) if voted else np.zeros(0, dtype=np.int32)
+    words = two_words(index.vocabulary, descriptors)
+    shape = (2, len(descriptors))
+    squared, other = np.full(shape, np.inf, dtype=np.float32), np.full(shape, np.inf, dtype=np.float32)
+    owner = np.full(shape, -1, dtype=np.int32)
+    for w in np.unique(words):
+        stored = index.probe[index.bounds[w] : index.bounds[w + 1]]
+        if not len(stored):
+            continue
+        probed = index.owner[stored]
+        turn, query = np.nonzero(words == w)
+        found = nearest(descriptors[query], index.descriptors[stored], probed)
+        squared[turn, query], other[turn, query] = found.squared, found.other
+        owner[turn, query] = probed[found.index]
+    rival = np.where(owner[0] != owner[1], np.maximum(squared[0], squared[1]), np.inf)
+    least, second = squared.min(axis=0), np.minimum(other.min(axis=0), rival)
+    good = least < _VOTING_RATIO**2 * second
+    landmark = np.unique(owner[squared.argmin(axis=0), np.arange(shape[1])][good])
     counts = index.starts[landmark + 1] - index.starts[landmark]
     before = np.cumsum(counts) - counts
     rows = np.repeat(index.starts[landmark] - before, counts) + np.arange(counts.sum())
