@@ -59,6 +59,21 @@ def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors) -> Float
     return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12), dtype=np.float32)
 
 
+def nearest_words(vocabulary: Vocabulary, descriptors: Descriptors) -> Ints:
+    """Return int32[n]: the word (row of the vocabulary) of each descriptor (n, w)."""
+    return _assign(_unit(descriptors), vocabulary.centres)
+
+
+def two_words(vocabulary: Vocabulary, descriptors: Descriptors) -> Ints:
+    """Return int32[2, n]: the nearest and the second nearest word of each descriptor (n, w)."""
+    points, size = _unit(descriptors), len(vocabulary.centres)
+    words = np.tile(_assign(points, vocabulary.centres), (2, 1))
+    for word in np.unique(words[0]) if size > 1 else ():
+        mine, others = np.flatnonzero(words[0] == word), np.delete(np.arange(size, dtype=np.int32), word)
+        words[1, mine] = others[_assign(points[mine], vocabulary.centres[others])]
+    return words
+
+
 def _unit(descriptors: Descriptors) -> Floats:
     values = np.asarray(descriptors, dtype=np.float32)
     return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12), dtype=np.float32)

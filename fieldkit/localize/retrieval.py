@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
-from fieldkit.features.vlad import Vocabulary, global_descriptor, train_vocabulary
+from fieldkit.features.nearest import nearest
+from fieldkit.features.vlad import Vocabulary, global_descriptor, nearest_words, train_vocabulary, two_words
 from fieldkit.types import SceneMap
 
 Ints = NDArray[np.int32]
+# A landmark of the query's word votes when its descriptor is this much nearer than any other's
+_VOTING_RATIO = 0.85
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,11 +23,21 @@ class Index:
 
     In a full map these are the image's own descriptors. In a compact map, where a landmark keeps one descriptor,
     they are those of the landmarks that the image observes.
+
+    ``probe`` is one row of ``descriptors`` for every landmark, word by word of the vocabulary, those of word i in
+    ``bounds[i]:bounds[i + 1]``; ``owner`` is whose landmark a descriptor is. Landmark i is seen by the images
+    ``seen[starts[i]:starts[i + 1]]``.
     """
 
     vocabulary: Vocabulary
     vectors: NDArray[np.float32]
     rows: tuple[Ints, ...]
+    descriptors: Descriptors
+    owner: Ints
+    probe: NDArray[np.int64]
+    bounds: NDArray[np.int64]
+    seen: Ints
+    starts: NDArray[np.int64]
 
 
 def build_index(scene_map: SceneMap, *, seed: int) -> Index:
@@ -35,7 +48,21 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
     vectors = np.empty((len(rows), vocabulary.centres.size), dtype=np.float32)
     for i, mine in enumerate(rows):
         vectors[i] = global_descriptor(vocabulary, scene_map.descriptors[mine])
-    return Index(vocabulary, vectors, rows)
+    _, first = np.unique(scene_map.descriptor_landmark, return_index=True)
+    word = nearest_words(vocabulary, scene_map.descriptors[first])
+    order = np.argsort(word, kind="stable")
+    by_landmark = np.argsort(scene_map.observation_landmark, kind="stable")
+    return Index(
+        vocabulary,
+        vectors,
+        rows,
+        scene_map.descriptors,
+        scene_map.descriptor_landmark,
+        first[order],
+        np.searchsorted(word[order], np.arange(len(vocabulary.centres) + 1)),
+        scene_map.observation_image[by_landmark],
+        np.searchsorted(scene_map.observation_landmark[by_landmark], np.arange(len(scene_map.xyz) + 1)),
+    )
 
 
 def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
@@ -61,8 +88,12 @@ def most_similar(index: Index, descriptors: Descriptors, *, count: int, among: N
 
     Only those in ``among`` bool[k], where it is given.
     """
-    vector = global_descriptor(index.vocabulary, descriptors)
-    return nearest_vectors(index.vectors, vector, count=count, among=among)
+    similarity = _similarity(index.vectors, global_descriptor(index.vocabulary, descriptors))
+    by_likeness, by_votes = (np.argsort(-v, kind="stable") for v in (similarity, _votes(index, descriptors)))
+    # In turns: either finds places that the other does not
+    both = np.column_stack([by_votes, by_likeness]).ravel()
+    _, first = np.unique(both, return_index=True)
+    return _first(both[np.sort(first)], count, among)
 
 
 def nearest_vectors(
@@ -73,10 +104,44 @@ def nearest_vectors(
     among: NDArray[np.bool_] | None = None,
 ) -> Ints:
     """Return the indices of the unit vectors f32[k, w] nearest to one f32[w], best first, as `most_similar` does."""
+    return _first(np.argsort(-_similarity(vectors, vector), kind="stable"), count, among)
+
+
+def _similarity(vectors: NDArray[np.float32], vector: NDArray[np.float32]) -> NDArray[np.float32]:
     # Summed by numpy itself: BLAS would start threads for it
-    similarity = np.einsum("kw,w->k", vectors, vector)
-    order = np.argsort(-similarity, kind="stable")
+    return np.asarray(np.einsum("kw,w->k", vectors, vector))
+
+
+def _first(order: NDArray[np.int64], count: int, among: NDArray[np.bool_] | None) -> Ints:
     return (order if among is None else order[among[order]])[:count].astype(np.int32)
+
+
+def _votes(index: Index, descriptors: Descriptors) -> NDArray[np.float64]:
+    """Return f64[k]: how many of the landmarks that an image saw are the nearest to a descriptor of the query.
+
+    Only landmarks of its two nearest words are compared, and those count that are clearly nearer than any other.
+    """
+    words = two_words(index.vocabulary, descriptors)
+    shape = (2, len(descriptors))
+    squared, other = np.full(shape, np.inf, dtype=np.float32), np.full(shape, np.inf, dtype=np.float32)
+    owner = np.full(shape, -1, dtype=np.int32)
+    for w in np.unique(words):
+        stored = index.probe[index.bounds[w] : index.bounds[w + 1]]
+        if not len(stored):
+            continue
+        probed = index.owner[stored]
+        turn, query = np.nonzero(words == w)
+        found = nearest(descriptors[query], index.descriptors[stored], probed)
+        squared[turn, query], other[turn, query] = found.squared, found.other
+        owner[turn, query] = probed[found.index]
+    rival = np.where(owner[0] != owner[1], np.maximum(squared[0], squared[1]), np.inf)
+    least, second = squared.min(axis=0), np.minimum(other.min(axis=0), rival)
+    good = least < _VOTING_RATIO**2 * second
+    landmark = np.unique(owner[squared.argmin(axis=0), np.arange(shape[1])][good])
+    counts = index.starts[landmark + 1] - index.starts[landmark]
+    before = np.cumsum(counts) - counts
+    rows = np.repeat(index.starts[landmark] - before, counts) + np.arange(counts.sum())
+    return np.bincount(index.seen[rows], minlength=len(index.vectors)).astype(np.float64)
 
 
 def _grouped(owner: Ints, count: int) -> list[NDArray[np.int64]]:
