@@ -27,8 +27,8 @@ from fieldkit.maps import (
     load_map,
     map_info,
 )
-from fieldkit.maps.tagged import TagScale, tag_scale
-from fieldkit.maps.upright import level_cameras, up_rotation
+from fieldkit.maps.metric.tagged import TagScale, tag_scale
+from fieldkit.maps.metric.upright import level_cameras, up_rotation
 from fieldkit.store import Rig, RigCamera, read_camera, write_rig, write_tum
 from fieldkit.tags import TagDetection, tag_corners
 

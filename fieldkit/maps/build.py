@@ -21,9 +21,6 @@ from fieldkit.features import Extractor, Features, feature_name, open_extractor
 from fieldkit.features.appearance import Appearance, open_appearance
 from fieldkit.features.matchers import PairMatcher, open_matcher
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity
-from fieldkit.maps.checking import check_images, content
-from fieldkit.maps.framing import look_for_tags, refuse_unscaled
 from fieldkit.maps.io import (
     AlignmentEntry,
     MapFile,
@@ -33,17 +30,20 @@ from fieldkit.maps.io import (
     write_map_file,
 )
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
-from fieldkit.maps.metric import depth_views
-from fieldkit.maps.options import MapOptions, MapReport, Progress
-from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
-from fieldkit.maps.placing import Matched, place_images
-from fieldkit.maps.plausible import plausible_matches
+from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.metric.choosing import look_for_tags, refuse_unscaled
+from fieldkit.maps.metric.depth import depth_views
+from fieldkit.maps.options import MapOptions, Progress
 from fieldkit.maps.record import write_record
-from fieldkit.maps.sfm import threads
-from fieldkit.maps.source import MapSource, SourceImage, read_depth, read_image, without_poses
+from fieldkit.maps.sources.checking import check_images, content
+from fieldkit.maps.sources.source import MapSource, SourceImage, read_depth, read_image, without_poses
+from fieldkit.maps.sources.streamrecorder import open_source
 from fieldkit.maps.stages import Stages, resumed, shares
-from fieldkit.maps.strays import strays
-from fieldkit.maps.streamrecorder import open_source
+from fieldkit.maps.structure.pairs import Pair, choose_pairs, match_pairs
+from fieldkit.maps.structure.placing import Matched, place_images
+from fieldkit.maps.structure.plausible import plausible_matches
+from fieldkit.maps.structure.sfm import threads
+from fieldkit.maps.structure.strays import strays
 from fieldkit.maps.whole import FILE, write_global
 from fieldkit.store import atomic_folder, digest, library_versions
 from fieldkit.store.files import refuse_existing
@@ -52,6 +52,21 @@ from fieldkit.types import Surface
 
 # Pairs whose matches are kept together: what a killed process loses at most
 _SHARE = 500
+
+
+@dataclasses.dataclass(frozen=True)
+class MapReport:
+    """What became of a SOURCE: counts, alignment, seconds per step, and what a user should know."""
+
+    path: str
+    digest: str
+    n_images: int
+    n_registered: int
+    n_landmarks: int
+    alignment: Alignment
+    has_surface: bool
+    seconds: Mapping[str, float]
+    warnings: tuple[str, ...]
 
 
 def build_map(

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity
-from fieldkit.maps.framing import find_frame, look_for_tags
 from fieldkit.maps.landmarks import Model
+from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.metric.choosing import find_frame, look_for_tags
 from fieldkit.maps.options import MapOptions, Progress
-from fieldkit.maps.source import MIN_POSES, DepthFrame, MapSource, SourceImage
-from fieldkit.maps.stamps import match_names
+from fieldkit.maps.sources.source import MIN_POSES, DepthFrame, MapSource, SourceImage
+from fieldkit.maps.sources.stamps import match_names
 from fieldkit.store import read_camera, read_tum
 
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]

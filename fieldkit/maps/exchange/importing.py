@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from fieldkit.errors import MapError
 from fieldkit.features import Features, feature_name
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Similarity
-from fieldkit.maps.build import alignment_entry, build_map
+from fieldkit.maps.build import MapReport, alignment_entry, build_map
 from fieldkit.maps.colmap import model_folder, read_model, write_model
-from fieldkit.maps.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
-from fieldkit.maps.import_frame import FrameOptions, metric_alignment, posed_walk
+from fieldkit.maps.exchange.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
+from fieldkit.maps.exchange.import_frame import FrameOptions, metric_alignment, posed_walk
+from fieldkit.maps.exchange.meshes import ForeignMesh, fit_mesh
 from fieldkit.maps.io import (
     MapFile,
     SurfaceEntry,
@@ -28,9 +28,9 @@ from fieldkit.maps.io import (
     write_map_file,
 )
 from fieldkit.maps.landmarks import LandmarkRules, Model, good_landmarks
-from fieldkit.maps.meshes import ForeignMesh, fit_mesh
-from fieldkit.maps.options import MapOptions, MapReport, Progress
-from fieldkit.maps.source import MapSource
+from fieldkit.maps.metric.align import Similarity
+from fieldkit.maps.options import MapOptions, Progress
+from fieldkit.maps.sources.source import MapSource
 from fieldkit.store import atomic_folder, refuse_existing
 from fieldkit.surface import write_ply
 from fieldkit.types import Surface
