@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
-from fieldkit.features.nearest import Ints, nearest
+from fieldkit.features.nearest import Ints, two_nearest
 
 Floats = NDArray[np.float32]
 
@@ -59,19 +59,9 @@ def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors) -> Float
     return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12), dtype=np.float32)
 
 
-def nearest_words(vocabulary: Vocabulary, descriptors: Descriptors) -> Ints:
-    """Return int32[n]: the word (row of the vocabulary) of each descriptor (n, w)."""
-    return _assign(_unit(descriptors), vocabulary.centres)
-
-
 def two_words(vocabulary: Vocabulary, descriptors: Descriptors) -> Ints:
-    """Return int32[2, n]: the nearest and the second nearest word of each descriptor (n, w)."""
-    points, size = _unit(descriptors), len(vocabulary.centres)
-    words = np.tile(_assign(points, vocabulary.centres), (2, 1))
-    for word in np.unique(words[0]) if size > 1 else ():
-        mine, others = np.flatnonzero(words[0] == word), np.delete(np.arange(size, dtype=np.int32), word)
-        words[1, mine] = others[_assign(points[mine], vocabulary.centres[others])]
-    return words
+    """Return int32[2, n]: the nearest and the second nearest word (row of the vocabulary) of each descriptor (n, w)."""
+    return two_nearest(_unit(descriptors), vocabulary.centres)
 
 
 def _unit(descriptors: Descriptors) -> Floats:
@@ -80,4 +70,4 @@ def _unit(descriptors: Descriptors) -> Floats:
 
 
 def _assign(points: Floats, centres: Floats) -> Ints:
-    return nearest(points, centres, np.arange(len(centres), dtype=np.int32)).index
+    return np.asarray(two_nearest(points, centres)[0])

@@ -8,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
-from fieldkit.features.nearest import nearest
-from fieldkit.features.vlad import Vocabulary, global_descriptor, nearest_words, train_vocabulary, two_words
+from fieldkit.features.nearest import Shelves, fill_shelves, nearest_on_shelves
+from fieldkit.features.vlad import Vocabulary, global_descriptor, train_vocabulary, two_words
 from fieldkit.types import SceneMap
 
 Ints = NDArray[np.int32]
 # A landmark of the query's word votes when its descriptor is this much nearer than any other's
 _VOTING_RATIO = 0.85
+# Landmarks of one word that may vote, those that most images saw: large maps stay quick
+_VOTERS = 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,18 +26,14 @@ class Index:
     In a full map these are the image's own descriptors. In a compact map, where a landmark keeps one descriptor,
     they are those of the landmarks that the image observes.
 
-    ``probe`` is one row of ``descriptors`` for every landmark, word by word of the vocabulary, those of word i in
-    ``bounds[i]:bounds[i + 1]``; ``owner`` is whose landmark a descriptor is. Landmark i is seen by the images
-    ``seen[starts[i]:starts[i + 1]]``.
+    ``voters`` holds one descriptor of each voting landmark, word by word of the vocabulary. The landmark of number i
+    is seen by the images ``seen[starts[i]:starts[i + 1]]`` when it votes, by none otherwise.
     """
 
     vocabulary: Vocabulary
     vectors: NDArray[np.float32]
     rows: tuple[Ints, ...]
-    descriptors: Descriptors
-    owner: Ints
-    probe: NDArray[np.int64]
-    bounds: NDArray[np.int64]
+    voters: Shelves
     seen: Ints
     starts: NDArray[np.int64]
 
@@ -48,21 +46,25 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
     vectors = np.empty((len(rows), vocabulary.centres.size), dtype=np.float32)
     for i, mine in enumerate(rows):
         vectors[i] = global_descriptor(vocabulary, scene_map.descriptors[mine])
-    _, first = np.unique(scene_map.descriptor_landmark, return_index=True)
-    word = nearest_words(vocabulary, scene_map.descriptors[first])
-    order = np.argsort(word, kind="stable")
-    by_landmark = np.argsort(scene_map.observation_landmark, kind="stable")
-    return Index(
-        vocabulary,
-        vectors,
-        rows,
-        scene_map.descriptors,
-        scene_map.descriptor_landmark,
-        first[order],
-        np.searchsorted(word[order], np.arange(len(vocabulary.centres) + 1)),
-        scene_map.observation_image[by_landmark],
-        np.searchsorted(scene_map.observation_landmark[by_landmark], np.arange(len(scene_map.xyz) + 1)),
+    return Index(vocabulary, vectors, rows, *_voters(scene_map, vocabulary))
+
+
+def _voters(scene_map: SceneMap, vocabulary: Vocabulary) -> tuple[Shelves, Ints, NDArray[np.int64]]:
+    landmark, first = np.unique(scene_map.descriptor_landmark, return_index=True)
+    word = two_words(vocabulary, scene_map.descriptors[first])[0]
+    n_seen = np.bincount(scene_map.observation_landmark, minlength=len(scene_map.xyz))
+    order = np.lexsort((-n_seen[landmark], word))
+    rank = np.arange(len(order)) - np.searchsorted(word[order], word[order])
+    kept = np.sort(order[rank < _VOTERS])
+    shelves = fill_shelves(
+        scene_map.descriptors[first[kept]], landmark[kept], word[kept], count=len(vocabulary.centres)
     )
+    votes = np.zeros(len(scene_map.xyz), dtype=bool)
+    votes[landmark[kept]] = True
+    cast = np.flatnonzero(votes[scene_map.observation_landmark])
+    cast = cast[np.argsort(scene_map.observation_landmark[cast], kind="stable")]
+    starts = np.searchsorted(scene_map.observation_landmark[cast], np.arange(len(scene_map.xyz) + 1))
+    return shelves, scene_map.observation_image[cast], starts
 
 
 def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
@@ -122,22 +124,12 @@ def _votes(index: Index, descriptors: Descriptors) -> NDArray[np.float64]:
     Only landmarks of its two nearest words are compared, and those count that are clearly nearer than any other.
     """
     words = two_words(index.vocabulary, descriptors)
-    shape = (2, len(descriptors))
-    squared, other = np.full(shape, np.inf, dtype=np.float32), np.full(shape, np.inf, dtype=np.float32)
-    owner = np.full(shape, -1, dtype=np.int32)
-    for w in np.unique(words):
-        stored = index.probe[index.bounds[w] : index.bounds[w + 1]]
-        if not len(stored):
-            continue
-        probed = index.owner[stored]
-        turn, query = np.nonzero(words == w)
-        found = nearest(descriptors[query], index.descriptors[stored], probed)
-        squared[turn, query], other[turn, query] = found.squared, found.other
-        owner[turn, query] = probed[found.index]
+    found = [nearest_on_shelves(descriptors, w, index.voters) for w in words]
+    owner, squared, other = (np.stack([getattr(f, n) for f in found]) for n in ("index", "squared", "other"))
     rival = np.where(owner[0] != owner[1], np.maximum(squared[0], squared[1]), np.inf)
     least, second = squared.min(axis=0), np.minimum(other.min(axis=0), rival)
     good = least < _VOTING_RATIO**2 * second
-    landmark = np.unique(owner[squared.argmin(axis=0), np.arange(shape[1])][good])
+    landmark = np.unique(owner[squared.argmin(axis=0), np.arange(len(descriptors))][good])
     counts = index.starts[landmark + 1] - index.starts[landmark]
     before = np.cumsum(counts) - counts
     rows = np.repeat(index.starts[landmark] - before, counts) + np.arange(counts.sum())
