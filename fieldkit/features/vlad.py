@@ -39,16 +39,17 @@ def train_vocabulary(descriptors: Descriptors, *, seed: int, size: int = 64, max
     return Vocabulary(centres)
 
 
-def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors) -> Floats:
+def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors, *, words: Ints | None = None) -> Floats:
     """Return the unit VLAD vector f32[k * w] of one image: residuals per centre, each normalised, square-rooted.
 
-    An image without descriptors gives zeros, which is equally far from every image.
+    ``words`` int32[n] are the descriptors' nearest centres where they are known. An image without descriptors gives
+    zeros, which is equally far from every image.
     """
     size, width = vocabulary.centres.shape
     result = np.zeros((size, width), dtype=np.float32)
     if len(descriptors):
         points = _unit(descriptors)
-        nearest = _assign(points, vocabulary.centres)
+        nearest = _assign(points, vocabulary.centres) if words is None else words
         order = np.argsort(nearest, kind="stable")
         words, starts = np.unique(nearest[order], return_index=True)
         residuals = points[order] - vocabulary.centres[nearest[order]]

@@ -90,8 +90,9 @@ def most_similar(index: Index, descriptors: Descriptors, *, count: int, among: N
 
     Only those in ``among`` bool[k], where it is given.
     """
-    similarity = _similarity(index.vectors, global_descriptor(index.vocabulary, descriptors))
-    by_likeness, by_votes = (np.argsort(-v, kind="stable") for v in (similarity, _votes(index, descriptors)))
+    words = two_words(index.vocabulary, descriptors)
+    similarity = _similarity(index.vectors, global_descriptor(index.vocabulary, descriptors, words=words[0]))
+    by_likeness, by_votes = (np.argsort(-v, kind="stable") for v in (similarity, _votes(index, descriptors, words)))
     # In turns: either finds places that the other does not
     both = np.column_stack([by_votes, by_likeness]).ravel()
     _, first = np.unique(both, return_index=True)
@@ -118,12 +119,12 @@ def _first(order: NDArray[np.int64], count: int, among: NDArray[np.bool_] | None
     return (order if among is None else order[among[order]])[:count].astype(np.int32)
 
 
-def _votes(index: Index, descriptors: Descriptors) -> NDArray[np.float64]:
+def _votes(index: Index, descriptors: Descriptors, words: Ints) -> NDArray[np.float64]:
     """Return f64[k]: how many of the landmarks that an image saw are the nearest to a descriptor of the query.
 
-    Only landmarks of its two nearest words are compared, and those count that are clearly nearer than any other.
+    Only landmarks of its two nearest ``words`` int32[2, n] are compared, and those count that are clearly nearer than
+    any other.
     """
-    words = two_words(index.vocabulary, descriptors)
     found = [nearest_on_shelves(descriptors, w, index.voters) for w in words]
     owner, squared, other = (np.stack([getattr(f, n) for f in found]) for n in ("index", "squared", "other"))
     rival = np.where(owner[0] != owner[1], np.maximum(squared[0], squared[1]), np.inf)
