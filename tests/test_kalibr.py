@@ -81,6 +81,8 @@ def test_with_the_imu_known_the_rig_is_the_imu(tmp_path: Path) -> None:
         (CAM0.replace("[458.6, 457.2, 367.2, 248.3]", "[1, 2]"), r"intrinsics is \[1, 2\]; expected 4 numbers"),
         (CAM0.replace("458.6", "-458.6"), "cam0: camera .* expected positive size and focal length"),
         (CAM0 + CAM1.replace("[0.0, 0.0, 1.0, 0.03]", "[0.0, 0.0, 2.0, 0.03]"), "cam1: T_cn_cnm1 is no rigid"),
+        (CAM0 + CAM1.replace("[0.0, 0.0, 1.0, 0.03]", "[0.0, 0.0, -1.0, 0.03]"), "cam1: T_cn_cnm1 is no rigid"),
+        (CAM0 + CAM1.replace("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 2.0]"), "cam1: T_cn_cnm1 is no rigid"),
         (CAM0 + CAM1.replace("T_cn_cnm1", "T_other"), "cam1: T_cn_cnm1 is no rigid transform"),
         ("a: [1", "not valid YAML"),
         ("[1, 2]", "no cam0 in it"),

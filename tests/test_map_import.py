@@ -211,6 +211,12 @@ def put(name: str, values: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5py
     return change
 
 
+def flatten(group: h5py.Group) -> None:
+    parent, name = group.parent, group.name
+    del parent[name]
+    parent[name] = 3
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -218,6 +224,8 @@ def put(name: str, values: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5py
         (put("descriptors", lambda d: np.repeat(d, 2, axis=0)), "width 256; sift has 128"),
         (put("descriptors", lambda d: d - np.float32(0.1)), "negative or not of length 1"),
         (put("descriptors", lambda d: d**6 / np.linalg.norm(d**6, axis=0)), "SIFT of another normalisation"),
+        (put("descriptors", lambda d: d * np.nan), "not finite"),
+        (flatten, "cannot be read"),
         (put("descriptors", lambda d: d[:, :-1]), r"keypoints .* expected \(n, 2\)"),
     ],
 )
@@ -227,6 +235,22 @@ def test_features_of_another_kind_are_refused(
     with pytest.raises(MapError, match=message):
         import_map(model, tmp_path / "lab.map", options=by_hloc(model, features=rewritten(model, tmp_path, change)))
     assert not (tmp_path / "lab.map").exists()
+
+
+def test_sift_is_no_other_feature_of_its_width(model: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="without negative numbers, as of SIFT; aliked has some"):
+        import_map(model, tmp_path / "lab.map", options=by_hloc(model, feature="aliked"))
+    assert not (tmp_path / "lab.map").exists()
+
+
+def test_observations_without_a_descriptor_do_not_hide_what_the_others_are(model: Path, tmp_path: Path) -> None:
+    def clear(descriptors: np.ndarray) -> np.ndarray:
+        return descriptors * (np.arange(descriptors.shape[1]) % 3 == 0)
+
+    features = rewritten(model, tmp_path, put("descriptors", clear))
+    import_map(model, tmp_path / "lab.map", options=by_hloc(model, features=features))
+    found = load_map(tmp_path / "lab.map")
+    assert 0 < found.descriptors.any(axis=1).sum() < 0.5 * len(found.observation_landmark)
 
 
 def test_features_of_other_images_are_refused(model: Path, tmp_path: Path) -> None:
@@ -369,6 +393,8 @@ def change_bytes(path: Path, change: Callable[[bytes], bytes]) -> None:
         (lambda p: change_bytes(p / "images.bin", lambda b: b.replace(b"000001.jpg", b"000000.jpg")),
          r"two images are called lf/000000\.jpg"),
         (lambda p: change_bytes(p / "cameras.bin", lambda b: b[:12] + b"\7" + b[13:]), "camera 1: unknown camera"),
+        (lambda p: change_bytes(p / "images.bin", lambda b: b[:44] + b"\0" * 6 + b"\xf0\x7f" + b[52:]),
+         "no readable COLMAP model"),
         (lambda p: [f.unlink() for f in p.iterdir()], "no COLMAP model in it"),
     ],
 )  # fmt: skip

@@ -80,4 +80,5 @@ def test_a_contradiction_keeps_the_slam_scale_and_is_said() -> None:
     kept, doubts = with_depth_scale(alignment(), DepthScale(0.7, 1e-4, 999), sfm_centres=CENTRES, slam_centres=CENTRES)
     assert kept.source == "slam"
     assert kept.map_from_sfm.scale == alignment().map_from_sfm.scale
-    assert "-30.0 % off in scale" in doubts[0]
+    assert kept.verdict == "warn"
+    assert "SLAM poses are +42.9 % off in scale" in doubts[0]

@@ -130,6 +130,8 @@ def without_lut(folder: Path) -> None:
         (lambda p: (p / "VLC_LF_extrinsics.txt").write_text("0," * 16), r"VLC_LF_extrinsics\.txt: "),
         (lambda p: (p / "VLC_LF_rig2world.txt").write_text("12,1,2\n"), "line 1: 3 fields; expected a time"),
         (lambda p: (p / "VLC_LF_lut.bin").write_bytes(b"\0" * 12), r"VLC_LF_lut\.bin: 3 numbers; expected three"),
+        (lambda p: (p / "VLC_LF_lut.bin").write_bytes(bytes(64 * 48 * 12)), r"VLC_LF_lut\.bin: hardly any of its rays"),
+        (lambda p: (p / "VLC_LF_extrinsics.txt").write_text("1,0,0,0,0,1,0,0,0,0,-1,0,0,0,0,1"), "a matrix mirrors"),
         (without_lut, r"VLC LF has no VLC_LF_lut\.bin; expected its rays"),
         (lambda p: [f.write_bytes(b"P5") for f in (p / "VLC_LF").iterdir()], r"\.pgm: cannot be read"),
     ],

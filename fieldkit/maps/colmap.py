@@ -186,6 +186,8 @@ def _observations(
             not len(point_ids) or (point_ids[np.minimum(found, len(point_ids) - 1)] != rows["point"][seen]).any()
         ):
             raise ValueError("a keypoint observes a point that is not there")
+        if not np.isfinite(rows["xy"][seen]).all():
+            raise ValueError("a keypoint is not finite")
         part = slice(end, end + len(seen))
         landmark[part], keypoint[part], pixels[part] = found, seen, rows["xy"][seen]
         count[i], end = len(seen), part.stop
@@ -207,7 +209,10 @@ def _read_name(file: io.BufferedReader) -> str:
 
 def _pose(wxyz: Array, translation: Array) -> Pose:
     """Return map_from_cam of cam_from_map as COLMAP stores it, through the matrix that COLMAP itself makes of it."""
-    w, x, y, z = (wxyz / np.linalg.norm(wxyz)).tolist()
+    length = float(np.linalg.norm(wxyz))
+    if not (np.isfinite(length) and length > 0 and np.isfinite(translation).all()):
+        raise ValueError("a pose is not finite")
+    w, x, y, z = (wxyz / length).tolist()
     matrix = np.eye(4)
     matrix[:3, :3] = [
         [1 - (2 * y * y + 2 * z * z), 2 * y * x - 2 * z * w, 2 * z * x + 2 * y * w],

@@ -95,8 +95,10 @@ def _transform(entry: dict[str, Any], key: str, place: str) -> Pose:
         matrix = np.array(entry.get(key), dtype=np.float64)
     except (TypeError, ValueError):
         matrix = np.zeros(0)
-    rotation = matrix[:3, :3] if matrix.shape == (4, 4) else np.zeros((3, 3))
-    if not np.isfinite(matrix).all() or not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
+    matrix = matrix if matrix.shape == (4, 4) and np.isfinite(matrix).all() else np.zeros((4, 4))
+    rotation = matrix[:3, :3]
+    rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    if not rigid or not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise StoreError(
             f"{place}: {key} is no rigid transform; expected 4 rows of 4 numbers", hint="calibrate the cameras together"
         )

@@ -66,7 +66,7 @@ def hloc_descriptors(path: Path, model: Model, *, feature: str) -> NDArray[Any]:
 
     try:
         return _at_keypoints(path, model, images(), feature)
-    except (OSError, KeyError, AttributeError) as error:
+    except (OSError, KeyError, AttributeError, TypeError, ValueError) as error:
         raise MapError(
             f"{path}: cannot be read: {error}; expected features as hloc writes them", hint="check the file"
         ) from error
@@ -145,21 +145,26 @@ def as_stored(path: Path, values: NDArray[Any], feature: str) -> NDArray[Any]:
     width = feature_kind(feature).width
     if values.shape[1] != width:
         raise _other_feature(path, f"descriptors of width {values.shape[1]}; {feature} has {width}", feature)
+    # Rows of zeros are observations without a descriptor, as in an exported compact map
+    numbers = values[values.any(axis=1)].astype(np.float32)
+    if not np.isfinite(numbers).all():
+        raise _other_feature(path, "descriptors that are not finite", feature)
     if feature not in SIFT:
         if values.dtype == np.uint8:
             raise _other_feature(path, f"8-bit descriptors, as of SIFT; {feature} has numbers", feature)
+        if len(numbers) and (numbers >= 0).all():
+            raise _other_feature(path, f"descriptors without negative numbers, as of SIFT; {feature} has some", feature)
         return values.astype(np.float32)
     if values.dtype == np.uint8:
         return np.ascontiguousarray(values)
-    if not len(values):
+    if not len(numbers):
         return values.astype(np.uint8)
-    numbers = values.astype(np.float32)
     length, total = np.linalg.norm(numbers, axis=1), numbers.sum(axis=1)
     if (numbers < 0).any() or abs(float(np.median(length)) - 1.0) > 0.05:
         raise _other_feature(path, "descriptors that are negative or not of length 1; SIFT's are neither", feature)
     if (float(np.median(total)) > _ROOT_SUM) != (feature == "sift"):
         raise _other_feature(path, f"SIFT of {'another' if feature == 'sift' else 'root'} normalisation", feature)
-    return np.asarray(np.clip(np.rint(512.0 * numbers), 0, 255), dtype=np.uint8)
+    return np.asarray(np.clip(np.rint(512.0 * values.astype(np.float32)), 0, 255), dtype=np.uint8)
 
 
 def _other_feature(path: Path, what: str, feature: str) -> MapError:

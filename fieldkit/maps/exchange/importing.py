@@ -112,7 +112,7 @@ def import_map(
     model = keep_landmarks(model, good)
     seconds["read"], start = time.perf_counter() - start, time.perf_counter()
     descriptors = _descriptors(model, images, options, tell)
-    warnings += _described(model, descriptors)
+    warnings += _described(folder, model, descriptors)
     seconds["describe"], start = time.perf_counter() - start, time.perf_counter()
     surface, doubts = (None, []) if options.mesh is None else fit_mesh(options.mesh, model)
     warnings += doubts if surface is not None else ["no mesh: the map has no surface, and occlusion cannot be computed"]
@@ -187,14 +187,14 @@ def _descriptors(model: Model, images: Path | None, options: ImportOptions, tell
     return image_descriptors(images, model, feature=options.feature, progress=tell, weights=options.weights)
 
 
-def _described(model: Model, descriptors: NDArray[Any]) -> list[str]:
+def _described(folder: Path, model: Model, descriptors: NDArray[Any]) -> list[str]:
     """Say how many landmarks have a descriptor; raises MapError when hardly any has."""
     filled = descriptors.any(axis=1)
     share = len(np.unique(model.observation_landmark[filled])) / len(model.xyz)
     if share < 0.1:
         raise MapError(
-            f"{100 * share:.0f} % of {len(model.xyz)} landmarks have keypoints of the feature within a pixel; expected "
-            "a model that was made with this feature",
+            f"{folder}: {100 * share:.0f} % of {len(model.xyz)} landmarks have keypoints of the feature within a "
+            "pixel; expected a model that was made with this feature",
             hint="give --feature with the model's own, or --features or --database",
         )
     return [] if share > 0.9 else [f"{100 * share:.0f} % of the landmarks have a descriptor; the others match nothing"]

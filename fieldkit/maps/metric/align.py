@@ -81,6 +81,11 @@ class Alignment:
     match_share: float | None = None
 
 
+def doubted(alignment: Alignment) -> Alignment:
+    """Return an alignment that does not pass: two sources of its scale contradict each other."""
+    return dataclasses.replace(alignment, verdict="warn") if alignment.verdict == "pass" else alignment
+
+
 def umeyama(source: Array, target: Array) -> Similarity:
     """Fit target = scale * rotation * source + translation to points (n, 3) by least squares (Umeyama, PAMI 1991)."""
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)

@@ -13,7 +13,7 @@ import pycolmap
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
 from fieldkit.maps.landmarks import Model, model_arrays
-from fieldkit.maps.metric.align import Alignment, Similarity, Verdict, align_to_slam
+from fieldkit.maps.metric.align import Alignment, Similarity, Verdict, align_to_slam, doubted
 from fieldkit.maps.metric.depth import DepthScale, depth_scale, rescaled, with_depth_scale
 from fieldkit.maps.metric.given import known_alignment
 from fieldkit.maps.metric.tagged import MIN_IMAGES, TagScale, find_tags, tag_scale
@@ -159,7 +159,8 @@ def _scaled_by_tags(
             f"tags say that the SLAM poses are {100 * (1.0 / ratio - 1):+.1f} % off in scale: check the tags' size; "
             "the tags are believed"
         )
-    verdict = _worst(alignment.verdict, _scale_verdict(tags.sigma, tags.apart))
+        scaled = doubted(scaled)
+    verdict = _worst(scaled.verdict, _scale_verdict(tags.sigma, tags.apart))
     return dataclasses.replace(scaled, source="tags", scale_sigma=tags.sigma, verdict=verdict), told
 
 
@@ -238,6 +239,7 @@ def _by_known(walk: MapSource, model: pycolmap.Reconstruction | Model, poses: Ma
     found = _depth_ratio(walk, model, poses, alignment.map_from_sfm)
     if found is not None and abs(found.ratio - 1.0) > max(0.02, 4.0 * found.sigma):
         told.append(f"depth images say that the known poses are {100 * (1.0 / found.ratio - 1):+.1f} % off in scale")
+        alignment = doubted(alignment)
     return alignment, told
 
 

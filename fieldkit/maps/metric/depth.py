@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose, mean_pose
 from fieldkit.maps.landmarks import Model
-from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.metric.align import Alignment, Similarity, doubted
 from fieldkit.maps.sources.source import DepthFrame, MapSource
 
 Array = NDArray[np.float64]
@@ -103,7 +103,7 @@ def _sigma(by_frame: list[Array], spread: float) -> float:
 def with_depth_scale(
     alignment: Alignment, found: DepthScale, *, sfm_centres: Array, slam_centres: Array, anyway: bool = False
 ) -> tuple[Alignment, list[str]]:
-    """Scale an alignment by depth; one that depth contradicts is kept, with a warning, unless scaled ``anyway``.
+    """Scale an alignment by depth; one that depth contradicts is kept, unless scaled ``anyway``, and does not pass.
 
     ``sfm_centres`` and ``slam_centres`` are the same camera centres (n, 3) in SfM's frame and as SLAM tracked them;
     frame and gravity stay SLAM's, and the residuals are those to its positions after scaling.
@@ -111,9 +111,11 @@ def with_depth_scale(
     told = []
     if abs(found.ratio - 1.0) > _MAX_CHANGE:
         told = [
-            f"depth images say that the map is {100 * (found.ratio - 1):+.1f} % off in scale ({found.n} landmarks); "
-            f"the {'depth' if anyway else 'SLAM'} scale is kept: check the units and the calibration of both"
+            f"depth images say that the SLAM poses are {100 * (1.0 / found.ratio - 1):+.1f} % off in scale "
+            f"({found.n} landmarks); {'depth is' if anyway else 'the poses are'} believed: check the units and the "
+            "calibration of both"
         ]
+        alignment = doubted(alignment)
         if not anyway:
             return alignment, told
     scaled = rescaled(alignment, found.ratio, sfm_centres=sfm_centres, slam_centres=slam_centres)

@@ -44,6 +44,8 @@ _SAME_S = 0.002
 # The nearest images tell where a depth image was taken, with SLAM's motion between
 _NEAR_S = 0.5
 _MAX_FIT_PX = 0.5
+# Rays with at least this z are fitted; where so few are, the table is none
+_AHEAD, _LEAST_RAYS = 0.05, 0.25
 _WORLD = Pose.from_components(np.zeros(3), Rotation.from_euler("x", 90, degrees=True))
 
 
@@ -157,6 +159,8 @@ def _matrix(path: Path, words: Sequence[str]) -> Pose | None:
     rotation = matrix[:3, :3]
     if not np.isfinite(matrix).all() or not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-2):
         return None
+    if np.linalg.det(rotation) < 0:
+        raise MapError(f"{path}: a matrix mirrors; expected rigid transforms", hint="copy it again")
     return Pose.from_components(matrix[:3, 3], Rotation.from_matrix(rotation))
 
 
@@ -187,7 +191,11 @@ def _rays(path: Path | None, shape: tuple[int, ...], turns: int) -> Array | None
             f"{path}: {values.size} numbers; expected three for each of {shape[1]}x{shape[0]} pixels",
             hint="copy it again",
         )
-    stored = values.reshape(-1, 3).astype(np.float64)
+    stored = np.nan_to_num(values.reshape(-1, 3).astype(np.float64), posinf=0.0, neginf=0.0)
+    if (stored[:, 2] > _AHEAD).mean() < _LEAST_RAYS:
+        raise MapError(
+            f"{path}: hardly any of its rays points ahead; expected a unit ray per pixel", hint="copy it again"
+        )
     turned = Rotation.from_euler("z", 90 * turns, degrees=True).apply(stored)
     return np.rot90(turned.reshape(*shape[:2], 3), -turns)
 
@@ -214,7 +222,7 @@ def fit_camera(rays: Array) -> tuple[Camera, float]:
     step = max(1, min(height, width) // 60)
     rows, columns = (a.ravel() for a in np.indices((height, width))[:, ::step, ::step])
     directions = rays[rows, columns]
-    ahead = directions[:, 2] > 0.05
+    ahead = directions[:, 2] > _AHEAD
     xy = directions[ahead, :2] / directions[ahead, 2:]
     pixels = np.column_stack([columns, rows])[ahead] + 0.5
 
