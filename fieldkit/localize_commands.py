@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote, unquote
 
 import numpy as np
 from rich.console import Console
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 # Heavy rooms are imported inside the command, as in fieldkit.cli
 
 _log = logging.getLogger(__name__)
+# Far beyond any building: nothing is narrowed then
+_MAX_SIGMA = 1e6
 STAGES = ("extract", "retrieve", "match", "pnp")
 
 
@@ -47,7 +51,7 @@ def localize(
     Args:
         images: image file or folder of images; with --rig a folder with images/<camera>/<frame>.jpg
         map: map folder
-        out: poses.txt to write; a failed image has no line
+        out: poses.txt to write; a failed image has no line, blanks in a name are %20
         camera: camera.toml of all images
         rig: rig.toml, for images that several cameras took at once: they make one pose
         top_k: mapping images that are compared with an image; more than the map has is all of them
@@ -67,13 +71,14 @@ def localize(
 
     store.refuse_existing(out, force=force, kind="file")
     _refuse_options(camera, rig, prior_poses)
+    _refuse_threads(threads)
     rules = protocol.localizer_rules(top_k=top_k, matcher=matcher, min_confidence=min_confidence)
     if rig is not None:
         cameras = store.read_rig(rig)
         localizer = Localizer(maps.load_map(map), rules, weights=weights)
         with ProgressBars() as progress:
             frames = localize_rig_files(localizer, images, cameras, threads=threads, progress=progress)
-        store.write_tum(out, [(n.replace(" ", "_"), e.map_from_rig) for n, e in frames if e.map_from_rig is not None])
+        store.write_tum(out, [(_tum_name(n), e.map_from_rig) for n, e in frames if e.map_from_rig is not None])
         _report("frame", [(n, e.status, e.n_matches, e.n_inliers, e.seconds) for n, e in frames], None if json else out)
         if json:
             print_json({"version": 1, "frames": [{"name": n, **_rig_json(e)} for n, e in frames]})
@@ -84,7 +89,7 @@ def localize(
     localizer = Localizer(maps.load_map(map), rules, weights=weights)
     with ProgressBars() as progress:
         found = localize_files(localizer, images, calibration, priors=priors, threads=threads, progress=progress)
-    store.write_tum(out, [(n.replace(" ", "_"), e.map_from_cam) for n, e in found if e.map_from_cam is not None])
+    store.write_tum(out, [(_tum_name(n), e.map_from_cam) for n, e in found if e.map_from_cam is not None])
     if priors is not None and any(n not in priors for n, _ in found):
         _log.warning("%d of %d images have no prior", sum(n not in priors for n, _ in found), len(found))
     _report("image", [(n, e.status, e.n_matches, e.n_inliers, e.seconds) for n, e in found], None if json else out)
@@ -101,17 +106,34 @@ def _refuse_options(camera: Path | None, rig: Path | None, prior_poses: Path | N
         raise LocalizeError("--prior-poses with --rig: expected it with --camera", hint="leave it out")
 
 
+def _refuse_threads(threads: int | None) -> None:
+    if threads is not None and threads < 1:
+        raise LocalizeError(f"--threads {threads}: expected 1 or more", hint="leave it out for one per processor")
+
+
+def _tum_name(name: str) -> str:
+    """Return a name as one word that begins no comment, as `unquote` gives it back."""
+    return re.sub(r"\s|^#|%", lambda found: quote(found[0]), name)
+
+
 def _read_priors(path: Path, sigma_m: float, sigma_deg: float) -> dict[str, CameraPrior]:
     from fieldkit import store
     from fieldkit.localize import CameraPrior
 
-    if not (0.0 < sigma_m < np.inf and 0.0 < sigma_deg < np.inf):
+    if not (0.0 < sigma_m <= _MAX_SIGMA and 0.0 < sigma_deg <= _MAX_SIGMA):
         raise LocalizeError(
-            f"--prior-sigma-m {sigma_m:g}, --prior-sigma-deg {sigma_deg:g}: expected more than 0",
+            f"--prior-sigma-m {sigma_m:g}, --prior-sigma-deg {sigma_deg:g}: expected 0 to {_MAX_SIGMA:g}, not 0",
             hint="say how far the camera may be from its prior",
         )
     covariance = np.diag([np.radians(sigma_deg) ** 2] * 3 + [sigma_m**2] * 3)
-    return {name: CameraPrior(pose, covariance) for name, pose in store.read_tum(path)}
+    priors: dict[str, CameraPrior] = {}
+    for name, pose in store.read_tum(path):
+        if unquote(name) in priors:
+            raise LocalizeError(f"{path}: {name} has two poses; expected one", hint="remove one of them")
+        priors[unquote(name)] = CameraPrior(pose, covariance)
+    if not priors:
+        raise LocalizeError(f"{path}: no pose in it; expected `name tx ty tz qx qy qz qw`", hint="check the file")
+    return priors
 
 
 Row = tuple[str, str, int | Mapping[str, int], int | Mapping[str, int], Mapping[str, float]]

@@ -15,6 +15,7 @@ from test_localize import noisy, scene
 
 from fieldkit import maps, store
 from fieldkit.bags import open_recording
+from fieldkit.cameras import Camera
 from fieldkit.cli import main
 from fieldkit.errors import FeatureError, LocalizeError
 from fieldkit.features.matching import match_groups
@@ -22,6 +23,7 @@ from fieldkit.frames import Pose, compose_covariance, exp, log, pose_error
 from fieldkit.localize import CameraPrior, Localizer, Query
 from fieldkit.localize.chance import Agreement, confidence, log_false_alarms
 from fieldkit.localize.files import localize_files, localize_rig_files
+from fieldkit.localize.localizer import _on_the_plane
 from fieldkit.localize.matching import _merged, features_of
 from fieldkit.localize.narrowing import plausible_images
 from fieldkit.localize.pose import _between, estimate_pose, refine_pose
@@ -353,3 +355,73 @@ def test_the_command_localizes_a_folder_and_a_rig(
     assert set(first["matches"]) == {"c0", "c1"}
     assert command(folder, *given, "--out", out, "--force") == 1
     assert "expected one of the two" in capsys.readouterr().err
+
+
+def test_names_of_images_come_back_from_the_poses_as_priors(
+    frames: list[Frame], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in ("a b.png", "a_b.png", "#c.png", "50%.png"):
+        cv2.imwrite(str(images / name), frames[0].read())
+    write_camera(tmp_path / "camera.toml", frames[0].camera)
+    given = [images, "--map", SAMPLE / "lab.map", "--camera", tmp_path / "camera.toml", "--out"]
+    assert command(*given, tmp_path / "poses.txt") == 0
+    assert len({n for n, _ in store.read_tum(tmp_path / "poses.txt")}) == 4
+    assert command(*given, tmp_path / "again.txt", "--prior-poses", tmp_path / "poses.txt") == 0
+    assert "have no prior" not in caplog.text
+    assert len(store.read_tum(tmp_path / "again.txt")) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "wrong"),
+    [
+        (["--threads", "0"], "--threads 0: expected 1 or more"),
+        (["--prior-poses", "empty.txt"], "no pose in it"),
+        (["--prior-poses", "twice.txt"], "a.png has two poses"),
+        (["--prior-poses", "once.txt", "--prior-sigma-m", "1e300"], "expected 0 to 1e+06, not 0"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(
+    options: list[str],
+    wrong: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.txt").touch()
+    write_tum(tmp_path / "twice.txt", [("a.png", Pose.identity())] * 2)
+    write_tum(tmp_path / "once.txt", [("a.png", Pose.identity())])
+    given = [folder, "--map", SAMPLE / "lab.map", "--camera", "camera.toml", "--out", "poses.txt"]
+    assert command(*given, *options) == 1
+    assert wrong in capsys.readouterr().err
+    assert not (tmp_path / "poses.txt").exists()
+
+
+def test_a_prior_of_unknown_covariance_is_refused(localizer: Localizer, frames: list[Frame]) -> None:
+    prior = CameraPrior(Pose.identity(), np.full((6, 6), np.nan))
+    with pytest.raises(LocalizeError, match="covariance is not finite"):
+        localizer.localize(frames[0].read(), frames[0].camera, prior=prior)
+
+
+def test_a_rig_of_another_size_and_two_images_of_one_frame_are_refused(
+    localizer: Localizer, frames: list[Frame], tmp_path: Path
+) -> None:
+    rig = rig_folder(tmp_path, frames)
+    half = dataclasses.replace(rig.cameras[1], camera=rig.cameras[1].camera.scaled(0.5))
+    with pytest.raises(LocalizeError, match=r"f1\.png: is 640x480; the camera says 320x240"):
+        localize_rig_files(localizer, tmp_path, Rig((rig.cameras[0], half)))
+    (tmp_path / "images" / "c0" / "f1.jpg").write_bytes(b"")
+    with pytest.raises(LocalizeError, match=r"f1\.png: a second image of this frame beside f1\.jpg"):
+        localize_rig_files(localizer, tmp_path, rig)
+
+
+def test_pixels_without_a_ray_before_the_camera_are_left_out() -> None:
+    fisheye = Camera("OPENCV_FISHEYE", 640, 480, (180.0, 180.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
+    barrel = Camera("OPENCV", 640, 480, (300.0, 300.0, 320.0, 240.0, -0.4, 0.0, 0.0, 0.0))
+    pixels = np.array([[320.0, 240.0], [420.0, 200.0], [5.0, 240.0], [2.0, 2.0]], dtype=np.float32)
+    assert _on_the_plane(fisheye, pixels).tolist() == [True, True, False, False]
+    assert _on_the_plane(barrel, pixels).tolist() == [True, True, False, False]
+    assert _on_the_plane(CAMERA, pixels).all()

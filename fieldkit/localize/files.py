@@ -61,12 +61,7 @@ def localize_files(
         return localizer.localize_query(Query(image, camera, priors.get(file.name)))
 
     found = list(_counted(in_threads(one, files, threads=threads or default_threads()), len(files), progress))
-    if sizes and (camera.height, camera.width) not in sizes.values():
-        file = min(sizes)
-        raise LocalizeError(
-            f"{file}: is {sizes[file][1]}x{sizes[file][0]}; the camera says {camera.width}x{camera.height}",
-            hint="give the camera with which the image was taken",
-        )
+    _refuse_other_size(sizes, camera)
     return [(f.name, e) for f, e in zip(files, found, strict=True)]
 
 
@@ -81,11 +76,40 @@ def localize_rig_files(
     """Localize the frames of a rig, images ``<camera>/<frame>.*`` of a folder or of ``images`` in it.
 
     A frame is what the images' names say without their suffix; cameras that have no image of a frame, or an
-    unreadable one or one of another size, are left out of it. Raises LocalizeError when there is no image, or a folder
-    of images of a camera that the rig does not have.
+    unreadable one or one of another size, are left out of it. Raises LocalizeError when there is no image, a folder
+    of images of a camera that the rig does not have, two images of one camera and frame, or a camera of which no image
+    has its size.
     """
-    root = folder / "images" if (folder / "images").is_dir() else folder
+    frames = _frames_of_rig(folder, rig)
     known = {c.name: c for c in rig.cameras}
+    sizes: dict[str, dict[Path, tuple[int, ...]]] = {}
+
+    def one(files: Mapping[str, Path]) -> RigEstimate:
+        images: dict[str, Image] = {}
+        for name, file in files.items():
+            image, camera = read(localizer, file), known[name].camera
+            if image is None:
+                continue
+            sizes.setdefault(name, {})[file] = image.shape[:2]
+            if image.shape[:2] == (camera.height, camera.width):
+                images[name] = image
+        return localizer.localize_rig(images, rig.cameras)
+
+    order = sorted(frames)
+    found = list(
+        _counted(
+            in_threads(one, [frames[f] for f in order], threads=threads or default_threads()), len(order), progress
+        )
+    )
+    for name in sorted(sizes):
+        _refuse_other_size(sizes[name], known[name].camera)
+    return list(zip(order, found, strict=True))
+
+
+def _frames_of_rig(folder: Path, rig: Rig) -> dict[str, dict[str, Path]]:
+    """Return the image files by frame and camera; raises LocalizeError as `localize_rig_files` does."""
+    root = folder / "images" if (folder / "images").is_dir() else folder
+    known = [c.name for c in rig.cameras]
     folders = [p for p in sorted(root.iterdir()) if p.is_dir()] if root.is_dir() else []
     by_camera = {p.name: _image_files(p) for p in folders}
     strange = [name for name, files in by_camera.items() if files and name not in known]
@@ -97,26 +121,27 @@ def localize_rig_files(
     frames: dict[str, dict[str, Path]] = {}
     for name, files in by_camera.items():
         for file in files:
-            frames.setdefault(file.stem, {})[name] = file
+            other = frames.setdefault(file.stem, {}).setdefault(name, file)
+            if other != file:
+                raise LocalizeError(
+                    f"{file}: a second image of this frame beside {other.name}; expected one of each camera",
+                    hint="move one of them away, or give it another name",
+                )
     if not frames:
         raise LocalizeError(
             f"{root}: no image found; expected folders {', '.join(known)} with the images of each frame",
             hint="check the path",
         )
+    return frames
 
-    def one(files: Mapping[str, Path]) -> RigEstimate:
-        images: dict[str, Image] = {}
-        for name, file in files.items():
-            image, camera = read(localizer, file), known[name].camera
-            if image is not None and image.shape[:2] == (camera.height, camera.width):
-                images[name] = image
-        return localizer.localize_rig(images, rig.cameras)
 
-    order = sorted(frames)
-    found = _counted(
-        in_threads(one, [frames[f] for f in order], threads=threads or default_threads()), len(order), progress
-    )
-    return list(zip(order, found, strict=True))
+def _refuse_other_size(sizes: Mapping[Path, tuple[int, ...]], camera: Camera) -> None:
+    if sizes and (camera.height, camera.width) not in sizes.values():
+        file = min(sizes)
+        raise LocalizeError(
+            f"{file}: is {sizes[file][1]}x{sizes[file][0]}; the camera says {camera.width}x{camera.height}",
+            hint="give the camera with which the image was taken",
+        )
 
 
 def read(localizer: Localizer, file: Path) -> Image | None:

@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 NOISE_PX = 1.0
 _MAX_KEYPOINTS = 2048
 _MAX_SIDE_PX = 1600
+# A pixel is undistorted rightly when its ray is seen this near to it again
+_SAME_PX = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -245,6 +247,8 @@ class Localizer:
             watch.stop("retrieve")
             size = camera.width, camera.height
             keypoint, landmark = self._match(features, size, self._index, images, threads)
+            sharp = _on_the_plane(camera, features.keypoints_px[keypoint])
+            keypoint, landmark = keypoint[sharp], landmark[sharp]
             watch.stop("match")
         factor = working_factor(image.shape[:2], max_side_px=_MAX_SIDE_PX)
         focal_px = np.asarray(camera.focal_px) * factor
@@ -297,6 +301,18 @@ class Localizer:
 
 def _agreement(matched: _Matched, residual_px: Array) -> Agreement:
     return Agreement(matched.pixels.astype(np.float64) * matched.factor, residual_px, matched.area_px)
+
+
+def _on_the_plane(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return bool[n]: which pixels have a ray that meets the plane before the camera, where poses are estimated.
+
+    Beyond the fold of a polynomial distortion, and at 90 degrees and more from a fisheye's axis, there is none.
+    """
+    if camera.is_pinhole:
+        return np.ones(len(pixels), dtype=bool)
+    again, inside = camera.project(camera.unproject(pixels))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(inside & (np.linalg.norm(again - pixels, axis=1) < _SAME_PX))
 
 
 def _prior_of(map_from_rig: CameraPrior, rig_from_cam: Pose) -> CameraPrior:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
+from fieldkit.errors import LocalizeError
 from fieldkit.frames import Pose
 from fieldkit.types import SceneMap
 
@@ -31,8 +32,11 @@ def plausible_images(scene_map: SceneMap, prior: CameraPrior, camera: Camera) ->
     """Return bool[k]: the mapping images that saw landmarks which may lie in the camera's view.
 
     The view is a cone about the principal axis that holds the whole image, wider by three standard deviations of
-    rotation and position. Walls do not hide anything: images of the next room stay.
+    rotation and position. Walls do not hide anything: images of the next room stay. Raises LocalizeError for a prior
+    whose covariance is not finite.
     """
+    if not np.isfinite(prior.covariance).all():
+        raise LocalizeError("the prior's covariance is not finite", hint="leave the prior out where nothing is known")
     corners = np.array([[0.0, 0.0], [camera.width, 0.0], [0.0, camera.height], [camera.width, camera.height]])
     rays = camera.unproject(corners)
     half = float(np.arctan(np.linalg.norm(rays[:, :2], axis=1).max()))
