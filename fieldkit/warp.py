@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse
-import scipy.sparse.linalg
 from numpy.typing import NDArray
 
+from fieldkit.factors import Factors, factorize
 from fieldkit.frames import Pose, skew
 from fieldkit.observations import PRIOR_M, errors_by_image
 from fieldkit.types import SceneMap
@@ -44,7 +44,7 @@ class MapWarp:
 
     sigma_px: float
     pulls: scipy.sparse.csr_array
-    factor: scipy.sparse.linalg.SuperLU
+    factor: Factors
     free: Array
     held: Array
 
@@ -72,7 +72,7 @@ class SharedErrors:
     rows: NDArray[np.int32]
     starts: NDArray[np.int64]
     views: _Views
-    factor: scipy.sparse.linalg.SuperLU
+    factor: Factors
     free: Array
     held: Array
 
@@ -92,7 +92,7 @@ class SharedErrors:
         return self.sigma_px**2 * _spread(flat, self.factor, self.free, self.held)
 
 
-def _spread(by_images: Array, factor: scipy.sparse.linalg.SuperLU, free: Array, held: Array) -> Array:
+def _spread(by_images: Array, factor: Factors, free: Array, held: Array) -> Array:
     # The map is laid on SLAM's positions: what moves all images together is no error (Baarda's S-transformation)
     back = np.linalg.pinv(held.T @ free) @ held.T
     by_images = by_images - by_images @ free @ back
@@ -110,7 +110,7 @@ def map_warp(scene_map: SceneMap) -> MapWarp:
     image = scene_map.observation_image
     pulls, information = _linearised(*views.derivatives(slice(None)), scene_map.observation_landmark, image, (n, k))
     free, held = _gauge(scene_map, np.arange(k), np.bincount(image, minlength=k))
-    return MapWarp(_sigma_px(scene_map), pulls, _factorized(information + _slam(k)), free, held)
+    return MapWarp(_sigma_px(scene_map), pulls, factorize(information + _slam(k)), free, held)
 
 
 def shared_errors(scene_map: SceneMap, *, max_images: int = MAX_IMAGES) -> SharedErrors:
@@ -138,7 +138,7 @@ def shared_errors(scene_map: SceneMap, *, max_images: int = MAX_IMAGES) -> Share
         information = information + _linearised(*views.derivatives(part), owner, image, (end - begin, len(chosen)))[1]
     seen = np.bincount(image_row[scene_map.observation_image[rows]], minlength=len(chosen))
     free, held = _gauge(scene_map, chosen, seen)
-    factor = _factorized(information)
+    factor = factorize(information)
     return SharedErrors(_sigma_px(scene_map), image_row, rows, starts, views, factor, free, held)
 
 
@@ -203,12 +203,6 @@ def _linearised(
 
 def _slam(count: int) -> scipy.sparse.csr_array:
     return _diagonal(np.tile(np.diag([SLAM_SIGMA_RAD**-2] * 3 + [SLAM_SIGMA_M**-2] * 3), (count, 1, 1)))
-
-
-def _factorized(information: scipy.sparse.csr_array) -> scipy.sparse.linalg.SuperLU:
-    return scipy.sparse.linalg.splu(
-        information.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}
-    )
 
 
 def _gauge(scene_map: SceneMap, images: NDArray[np.int64], seen: NDArray[np.int64]) -> tuple[Array, Array]:

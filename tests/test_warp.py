@@ -6,12 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.sparse
+import scipy.sparse.linalg
 from calibration_scenes import photograph
 from scipy.spatial.transform import Rotation
 from synthetic_map import make_map
 
 from fieldkit.calibrate.adjustment import Corners, Landmarks, adjust, adjust_cameras
 from fieldkit.calibrate.geometry import Poses
+from fieldkit.factors import factorize
 from fieldkit.frames import Array
 from fieldkit.maps import MapWarp, map_warp
 from fieldkit.types import SceneMap
@@ -151,3 +154,11 @@ def test_with_little_memory_the_shared_errors_are_the_same_and_of_fewer_images_l
     np.testing.assert_allclose(shared_errors(room).covariance(landmark, response), whole, rtol=1e-7, atol=1e-12)
     fewer = shared_errors(room, max_images=15).covariance(landmark, response)
     assert np.trace(fewer) > 1.2 * np.trace(whole)
+
+
+def test_factors_solve_as_superlu_does(rng: np.random.Generator) -> None:
+    matrix = scipy.sparse.random_array((60, 60), density=0.05, rng=rng)
+    symmetric = scipy.sparse.csr_array(matrix @ matrix.T + scipy.sparse.eye_array(60))
+    right = rng.normal(size=(60, 6))
+    expected = scipy.sparse.linalg.splu(symmetric.tocsc()).solve(right)
+    np.testing.assert_allclose(factorize(symmetric).solve(right), expected, rtol=1e-9, atol=1e-12)
