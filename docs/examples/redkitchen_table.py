@@ -1,9 +1,9 @@
 """Localize the 7-Scenes red kitchen with every feature and print recall, errors and seconds as a markdown table.
 
 Blocks of 100 frames: even ones make the map, odd ones are localized in it. `--split interleaved` maps every second
-frame instead; its queries are near duplicates of mapping images. A map's own images are aligned to the truth by a similarity
-first, so that only the localization is judged. There are two truths: the given poses (KinectFusion's, which drift by
-some centimetres and two degrees), and the poses of one COLMAP SfM over all frames.
+frame instead; its queries are near duplicates of mapping images. The images of a map are aligned to the truth by a
+similarity first, so that only the localization is judged. There are two truths: the given poses (of KinectFusion, which
+drift by some centimetres and two degrees), and the poses of one COLMAP SfM over all frames.
 
     python docs/examples/redkitchen_table.py DATA --out build/redkitchen_table
 """
