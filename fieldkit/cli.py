@@ -18,7 +18,8 @@ from tyro.conf import UseAppendAction as Repeated
 from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
-from fieldkit.map_commands import map_build, map_compact, map_info
+from fieldkit.localize_commands import localize
+from fieldkit.map_commands import map_build, map_compact, map_export, map_import, map_info
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
 from fieldkit.tag_tables import print_second, print_tags, second_json, tags_json
 
@@ -49,6 +50,7 @@ def tags_calibrate(
     check_map: Path | None = None,
     family: Repeated[tuple[str, ...]] = (),
     detector: Literal["pupil", "opencv"] | None = None,
+    weights: Path | None = None,
     json: bool = False,
     force: bool = False,
 ) -> int:
@@ -63,11 +65,13 @@ def tags_calibrate(
         check_map: another map of the place, such as one of another feature: compare where it localizes the photos
         family: tag family, by default tag36h11; may be repeated
         detector: what finds the tags; by default pupil, and opencv for tag36h10
+        weights: folder where the weights of networks are looked for first
         json: print JSON
         force: replace an existing file
     """
     from fieldkit import store
     from fieldkit.calibrate import calibrate_photos, check_in_second_map, parse_sizes, refuse_same_map
+    from fieldkit.features.weights import weights_first_in
     from fieldkit.maps import load_map
 
     store.refuse_existing(out, force=force, kind="file")
@@ -76,7 +80,7 @@ def tags_calibrate(
     other = None if check_map is None else load_map(check_map)
     if other is not None:
         refuse_same_map(scene_map, other)
-    with ProgressBars() as progress:
+    with ProgressBars() as progress, weights_first_in(weights):
         tags = calibrate_photos(
             photos, scene_map, camera=camera, sizes_m=sizes_m, families=families, detector=detector, progress=progress
         )
@@ -105,41 +109,6 @@ def tags_calibrate(
     return contradicted
 
 
-def localize(
-    images: Positional[Path], *, map: Path, camera: Path, out: Path, json: bool = False, force: bool = False
-) -> None:
-    """Localize images in a map; write the poses as TUM text.
-
-    Args:
-        images: image file or folder of images
-        map: map folder
-        camera: camera.toml
-        out: poses.txt to write; a failed image has no line
-        json: print JSON with status, inliers, covariance and seconds per image
-        force: replace an existing file
-    """
-    from fieldkit import maps, store
-    from fieldkit.localize import Localizer
-    from fieldkit.localize.files import localize_files
-
-    store.refuse_existing(out, force=force, kind="file")
-    calibration = store.read_camera(camera)
-    localizer = Localizer(maps.load_map(map))
-    with ProgressBars() as progress:
-        found = localize_files(localizer, images, calibration, progress=progress)
-    store.write_tum(out, [(n.replace(" ", "_"), e.map_from_cam) for n, e in found if e.map_from_cam is not None])
-    failed = [f"{n} ({e.status})" for n, e in found if e.map_from_cam is None]
-    if failed:
-        logging.getLogger(__name__).warning("%d of %d images failed: %s", len(failed), len(found), ", ".join(failed))
-    if json:
-        print_json({"version": 1, "images": [{"name": n, **_estimate_json(e)} for n, e in found]})
-        return
-    table = make_table("image", "status", "matches", "inliers", "seconds")
-    for name, e in found:
-        table.add_row(*cells([name, e.status, e.n_matches, e.n_inliers, f"{sum(e.seconds.values()):.2f}"]))
-    Console().print(table)
-
-
 def replay(
     recordings: Positional[tuple[Path, ...]],
     *,
@@ -149,6 +118,7 @@ def replay(
     camera: Path | None = None,
     hand: Path | None = None,
     protocol: str = "paper_real",
+    weights: Path | None = None,
     force: bool = False,
 ) -> int:
     """Replay recordings through every policy of a protocol; print the recall table, exit with 3 on a missed bound.
@@ -161,16 +131,18 @@ def replay(
         camera: camera.toml to use in place of what the recordings state, as of `tags check --refine-camera`
         hand: hand.toml to use in place of what the recordings state, as of `tags check --refine-hand`
         protocol: name of a protocol, or a .toml file
+        weights: folder where the weights of networks are looked for first
         force: replace an existing run
     """
     from fieldkit import protocol as protocols
+    from fieldkit.features.weights import weights_first_in
     from fieldkit.store import is_dataset
 
     rules = protocols.load(protocol)
     sets = [r for r in recordings if is_dataset(r)]
     theirs = {"--map": map, "--tags": tags, "--camera": camera, "--hand": hand}
     _refuse_mixture(recordings, sets, {name: path for name, path in theirs.items() if path is not None})
-    with ProgressBars() as progress:
+    with ProgressBars() as progress, weights_first_in(weights):
         if sets:
             from fieldkit.dataset import replay_datasets
 
@@ -301,7 +273,13 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "judge": judge,
 }
 GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
-    "map": {"build": map_build, "info": map_info, "compact": map_compact},
+    "map": {
+        "build": map_build,
+        "import": map_import,
+        "export": map_export,
+        "info": map_info,
+        "compact": map_compact,
+    },
     "tags": {
         "sheet": tags_sheet,
         "calibrate": tags_calibrate,
@@ -363,20 +341,6 @@ def _missed_bounds(run: Any) -> int:
     for miss in misses:
         logging.getLogger(__name__).error("%s: %s", run.path or run.protocol.name, miss)
     return 3 if misses else 0
-
-
-def _estimate_json(estimate: Any) -> dict[str, Any]:
-    found = estimate.map_from_cam
-    return {
-        "status": estimate.status,
-        "position_m": None if found is None else found.translation,
-        "quaternion_xyzw": None if found is None else found.rotation.as_quat(),
-        "matches": estimate.n_matches,
-        "inliers": estimate.n_inliers,
-        "confidence": estimate.confidence,
-        "covariance": None if estimate.covariance is None else estimate.covariance.ravel(),
-        "seconds": dict(estimate.seconds),
-    }
 
 
 if __name__ == "__main__":

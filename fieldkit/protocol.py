@@ -49,12 +49,18 @@ class OcclusionRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LocalizerRules(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings of the localizer: global retrieval, matching, and PnP."""
+    """Settings of the localizer: global retrieval, matching, PnP, and the confidence below which a pose is none.
+
+    ``top_k`` mapping images are retrieved; more than there are, as 1,000,000, is all of them. ``matcher`` "lightglue"
+    matches with the best three of them by that network, for the features that have one.
+    """
 
     top_k: Annotated[int, msgspec.Meta(ge=1)] = 20
     ratio: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.8
     max_reprojection_px: Positive = 12.0
     min_inliers: Annotated[int, msgspec.Meta(ge=4)] = 12
+    min_confidence: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.5
+    matcher: Literal["nearest", "lightglue"] = "nearest"
 
 
 class OdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -145,6 +151,14 @@ def from_dict(values: dict[str, Any], *, source: str) -> Protocol:
         raise ProtocolError(f"{source}: {_explain(str(error))}", hint="correct the protocol") from error
     _check(protocol, source)
     return protocol
+
+
+def localizer_rules(**values: Any) -> LocalizerRules:
+    """Make rules of the localizer from options of a command; raises ProtocolError for a value out of range."""
+    try:
+        return msgspec.convert(values, LocalizerRules)
+    except msgspec.ValidationError as error:
+        raise ProtocolError(f"localizer: {error}", hint="correct the option") from error
 
 
 def to_dict(protocol: Protocol) -> dict[str, Any]:

@@ -104,6 +104,10 @@ def replay(
         for r in opened
     ]
     run = _collect(opened, sessions, scene_map=scene_map, tags=tags, applied=given.applied, protocol=protocol)
+    unfiltered = policies.unfiltered(scene_map, protocol)
+    if unfiltered is not None:
+        log.warning("%s are excluded: %s", unfiltered.what, unfiltered.reason)
+        run = dataclasses.replace(run, excluded=(unfiltered, *run.excluded))
     if not run.trials:
         reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3]) or "there is no visit"
         raise ReplayError(f"{recordings[0]}: no visit could be scored: {reasons}", hint="see the reasons")

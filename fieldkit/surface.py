@@ -24,6 +24,7 @@ Depth = NDArray[np.uint16]
 # Read on demand, so that a long walk does not have to fit into memory: map_from_cam, and the image in mm (0 = none).
 DepthView = tuple[Pose, Callable[[], Depth]]
 
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 _MAX_VOXELS = 200_000_000
 _CHUNK_RAYS = 1_000_000
 
@@ -211,7 +212,7 @@ def read_ply(path: Path) -> Surface:
             f"{path}: cannot be read: {error.strerror}; expected a PLY mesh", hint="check the path"
         ) from error
     own = _read_own_ply(content)
-    return _read_foreign_ply(path) if own is None else own
+    return _read_foreign(path) if own is None else own
 
 
 def _read_own_ply(content: bytes) -> Surface | None:
@@ -230,18 +231,38 @@ def _read_own_ply(content: bytes) -> Surface | None:
     )
 
 
-def _read_foreign_ply(path: Path) -> Surface:
+def _read_foreign(path: Path) -> Surface:
     import trimesh
 
     try:
-        mesh = trimesh.load_mesh(path, process=False)
-        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32)
+        loaded = trimesh.load(path, process=False, skip_materials=True)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        # A cloud of points has no faces at all
+        faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int32)
     except Exception as error:  # trimesh raises many types for damaged files
-        raise SurfaceError(f"{path}: not a readable PLY mesh: {error}", hint="check the file") from error
+        raise SurfaceError(f"{path}: not a readable mesh: {error}", hint="check the file") from error
     if faces.ndim != 2 or not len(faces):
         raise SurfaceError(f"{path}: has no triangles; expected a triangle mesh", hint="export the mesh with faces")
     edges = np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)
     return Surface(vertices, faces, float(np.median(edges)))
+
+
+def read_mesh(path: Path) -> Surface:
+    """Read a triangle mesh of any tool (PLY, OBJ, GLB, GLTF, STL, OFF) as its file has it, without unit or axes.
+
+    Raises SurfaceError when it is missing or has no triangles.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".ply":
+        return read_ply(path)
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise SurfaceError(
+            f"{path}: is no mesh file known here; expected {', '.join(MESH_SUFFIXES)}", hint="convert the mesh"
+        )
+    if not path.is_file():
+        raise SurfaceError(f"{path}: no such file; expected a mesh", hint="check the path")
+    return _read_foreign(path)
 
 
 class RayCaster:

@@ -16,6 +16,9 @@ from fieldkit.types import Candidates, LandmarkStatistics, PlanView, Prior, Reco
 
 Array = NDArray[np.float64]
 PLAN_LANDMARKS = 6000
+_SAME_PLACE_M = 1e-6
+# Cells per side of the map of where mapping images saw a landmark, as in the paper
+HEAT_CELLS = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +56,29 @@ def landmark_statistics(scene_map: SceneMap) -> LandmarkStatistics:
         spread_rad=_extreme(np.maximum, landmark, deviation, n),
         n_observations=np.bincount(landmark, minlength=n).astype(np.int32),
     )
+
+
+def landmark_heat_maps(
+    scene_map: SceneMap, landmarks: NDArray[np.integer], *, cells: int = HEAT_CELLS
+) -> NDArray[np.float32]:
+    """Return f32[k, cells, cells] for some landmarks (k): where in their images the mapping cameras saw each.
+
+    Rows go down the image and columns to the right; every map sums to 1. Of all landmarks of a large map they are many
+    gigabytes: ask for those that are needed.
+    """
+    wanted = np.asarray(landmarks, dtype=np.int64)
+    row = np.full(len(scene_map.xyz), -1, dtype=np.int64)
+    unique, first = np.unique(wanted, return_inverse=True)
+    row[unique] = np.arange(len(unique))
+    owner = row[scene_map.observation_landmark]
+    seen = np.flatnonzero(owner >= 0)
+    sizes = np.array([(c.width, c.height) for c in scene_map.image_cameras], dtype=np.float64).reshape(-1, 2)
+    place = scene_map.observation_px[seen] / sizes[scene_map.observation_image[seen]]
+    column, line = np.clip((place * cells).astype(np.int64), 0, cells - 1).T
+    index = (owner[seen] * cells + line) * cells + column
+    counts = np.bincount(index, minlength=len(unique) * cells**2).reshape(len(unique), cells, cells)
+    shares = counts / np.maximum(counts.sum(axis=(1, 2), keepdims=True), 1)
+    return np.asarray(shares.astype(np.float32)[first.ravel()])
 
 
 def _extreme(ufunc: np.ufunc, landmark: NDArray[np.int32], values: Array, n: int) -> Array:
@@ -164,9 +190,11 @@ def _drop_hidden(
     rays: RayCaster,
     tolerance_m: float,
 ) -> list[NDArray[np.int32]]:
-    groups: dict[bytes, list[int]] = {}
+    groups: dict[tuple[int, ...], list[int]] = {}
     for index, pose in enumerate(poses):
-        groups.setdefault(pose.translation.tobytes(), []).append(index)
+        # Centres that differ by rounding only, far below a voxel, are one
+        place = np.rint(pose.translation / _SAME_PLACE_M).astype(np.int64)
+        groups.setdefault(tuple(place.tolist()), []).append(index)
     result = list(inside)
     for members in groups.values():
         targets = np.unique(np.concatenate([inside[m] for m in members]))

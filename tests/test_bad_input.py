@@ -115,11 +115,13 @@ def map_without_surface(tmp_path: Path) -> tuple[Path, Path]:
     return lab, tags
 
 
-def test_occlusion_without_a_surface(
+def test_a_protocol_of_occlusion_alone_needs_a_surface(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], map_without_surface: tuple[Path, Path]
 ) -> None:
     lab, tags = map_without_surface
-    line = replay(capsys, tmp_path, map=lab, tags=tags)
+    text = (SAMPLE.parents[1] / "protocols" / "paper_real.toml").read_text()
+    (tmp_path / "hidden.toml").write_text(text + "\n[occlusion]\nuse = [true]\n")
+    line = replay(capsys, tmp_path, map=lab, tags=tags, protocol=tmp_path / "hidden.toml")
     assert "flat.map: has no surface; expected surface.ply" in line
     assert "occlusion.use = [false]" in line
 

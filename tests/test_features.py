@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from fieldkit.errors import FeatureError
-from fieldkit.features import FEATURES, extract, read_grey
+from fieldkit.features import FEATURES, extract, feature_name, read_grey, read_image
 from fieldkit.features.matching import match_groups, match_pair
+from fieldkit.features.sift import root_sift
 from fieldkit.features.vlad import global_descriptor, train_vocabulary
 
 
@@ -98,6 +99,34 @@ def test_a_missing_or_damaged_image_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff not an image")
     with pytest.raises(FeatureError, match=r"broken\.jpg: cannot be read as an image"):
         read_grey(tmp_path / "broken.jpg")
+
+
+def test_colour_files_are_read_as_rgb_and_grey_ones_repeated(tmp_path: Path) -> None:
+    red = np.zeros((6, 8, 3), np.uint8)
+    red[:, :, 2] = 200
+    cv2.imwrite(str(tmp_path / "red.png"), red)
+    np.testing.assert_array_equal(read_image(tmp_path / "red.png", colour=True)[0, 0], [200, 0, 0])
+    np.testing.assert_array_equal(read_image(tmp_path / "red.png", colour=False), read_grey(tmp_path / "red.png"))
+    cv2.imwrite(str(tmp_path / "grey.png"), red[:, :, 2])
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png", colour=True), np.full((6, 8, 3), 200))
+
+
+def test_rootsift_is_a_name_of_sift_and_lowe_s_sift_has_the_same_keypoints(rng: np.random.Generator) -> None:
+    image = texture(rng)
+    assert feature_name("rootsift") == "sift"
+    root, lowe = extract(image, feature="rootsift"), extract(image, feature="sift_l2")
+    np.testing.assert_array_equal(root.keypoints_px, lowe.keypoints_px)
+    assert lowe.descriptors.dtype == np.uint8
+    np.testing.assert_allclose(np.linalg.norm(lowe.descriptors.astype(float), axis=1), 512, rtol=0.03)
+    np.testing.assert_array_equal(root.descriptors, root_sift(lowe.descriptors.astype(np.float32)))
+
+
+def test_neighbours_that_are_not_alike_enough_are_no_match() -> None:
+    first, second = np.eye(4, dtype=np.float32), np.eye(4, dtype=np.float32)
+    second[2] = [0.0, 0.6, 0.8, 0.0]
+    assert [tuple(p) for p in match_pair(first, second, ratio=1.0)] == [(0, 0), (1, 1), (2, 2), (3, 3)]
+    kept = match_pair(first, second, ratio=1.0, min_cosine=0.9)
+    assert [tuple(p) for p in kept] == [(0, 0), (1, 1), (3, 3)]
 
 
 def brute_force_pairs(a: np.ndarray, b: np.ndarray, ratio: float) -> list[tuple[int, int]]:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 
 import numpy as np
+import pytest
 from synthetic_map import CAMERA, looking
 
+from fieldkit.errors import MapError
 from fieldkit.features import Features
 from fieldkit.frames import Pose, exp
-from fieldkit.maps.build import MapOptions, _Matched, _place, _unfolded
+from fieldkit.maps.options import MapOptions
+from fieldkit.maps.placing import Matched, place_once, unfolded
 from fieldkit.maps.plausible import SlamRules, plausible_pairs
 from fieldkit.maps.sfm import relative_poses
 from fieldkit.maps.source import MapSource, SourceImage
-from fieldkit.maps.strays import contradicting
+from fieldkit.maps.stages import Stages
+from fieldkit.maps.strays import contradicting, strays
 
 PLACES = [looking(np.array([x, 0.0, 1.5]), np.pi / 2) for x in (0.0, 1.0)]
 ELSEWHERE = PLACES[1] * exp([0.0, 0.0, 0.0, 0.0, 0.0, 3.0])
@@ -72,7 +77,43 @@ def test_an_image_contradicts_where_it_is_farther_from_slam_than_drift_goes() ->
     assert contradicting(images, mapped, threshold_m=1.1) == set()
 
 
-def two_rooms(rng: np.random.Generator) -> _Matched:
+def corridor() -> tuple[list[SourceImage], dict[int, Pose]]:
+    """A walk of 10 m to a dead end and back, in steps of 0.4 m."""
+    way = [*np.arange(0.0, 10.0, 0.4), *np.arange(10.0, 0.0, -0.4)]
+    places = [looking(np.array([x, 0.0, 1.5]), 0.0) for x in way]
+    images = [SourceImage(f"{k:03d}.jpg", Path(), CAMERA, "", f"{k:03d}", p) for k, p in enumerate(places)]
+    return images, dict(enumerate(places))
+
+
+def test_the_end_of_a_corridor_that_lies_on_its_beginning_is_told(rng: np.random.Generator) -> None:
+    images, true = corridor()
+    assert strays(images, true, threshold_m=0.05) == []
+    end = [i for i, p in true.items() if p.translation[0] > 6.0]
+    back = Pose.from_translation([-5.0, 0.0, 0.0])
+    folded = true | {i: back * true[i] for i in end}
+    assert strays(images, folded, threshold_m=0.05) == end
+    last = list(range(46, 50))
+    open_end = true | {i: Pose.from_translation([3.0, 0.0, 0.0]) * true[i] for i in last}
+    assert strays(images, open_end, threshold_m=0.05) == last
+
+
+def test_a_stretch_that_slam_has_elsewhere_stays_in_the_map(rng: np.random.Generator) -> None:
+    images, true = corridor()
+    jump = Pose.from_translation([-4.0, 1.0, 0.0])
+    lost = [replaced(image, jump) if 20 <= i < 33 else image for i, image in enumerate(images)]
+    assert strays(lost, true, threshold_m=0.05) == []
+    wrong = rng.random(len(images)) < 0.3
+    off = [Pose.from_translation(rng.normal(0, 2.0, 3)) for _ in images]
+    scattered = [replaced(image, off[i]) if wrong[i] else image for i, image in enumerate(images)]
+    assert strays(scattered, true, threshold_m=0.05) == []
+
+
+def replaced(image: SourceImage, moved: Pose) -> SourceImage:
+    assert image.slam_from_cam is not None
+    return dataclasses.replace(image, slam_from_cam=moved * image.slam_from_cam)
+
+
+def two_rooms(rng: np.random.Generator) -> Matched:
     """Return a walk past two identical rooms 6 m apart with little between them, with the matches of both kinds."""
     room = rng.uniform([-0.8, 2.2, 0.6], [0.8, 3.4, 2.4], (150, 3))
     wall = rng.uniform([0.5, 2.6, 0.6], [5.5, 3.2, 2.4], (70, 3))
@@ -95,13 +136,47 @@ def two_rooms(rng: np.random.Generator) -> _Matched:
         common = [(n, other[int(i)]) for n, i in enumerate(ids[a]) if int(i) in other and (twin or b - a < 5)]
         pairs.append((a, b))
         matches.append(np.array(common, np.uint32).reshape(-1, 2))
-    return _Matched(MapSource(Path("two rooms"), tuple(images), None, ()), seen, pairs, matches)
+    return Matched(MapSource(Path("two rooms"), tuple(images), None, ()), seen, pairs, matches)
 
 
-def test_a_map_in_which_one_room_lies_on_the_next_is_unfolded(rng: np.random.Generator) -> None:
-    found, options = two_rooms(rng), MapOptions(n_threads=1)
-    folded = _place(found, options, 0, lambda step, done, total: None)
+def test_a_map_in_which_one_room_lies_on_the_next_is_unfolded(tmp_path: Path, rng: np.random.Generator) -> None:
+    found, options, stages = two_rooms(rng), MapOptions(n_threads=1), Stages(tmp_path, {})
+    folded = place_once(found, stages, options, seed=0, progress=quiet)
     assert folded.contradicting > 0.05 * len(folded.sfm_poses)
-    again = _place(_unfolded(found, SlamRules(), options, 0), options, 0, lambda step, done, total: None)
+    less = unfolded(found, SlamRules(), stages, options, seed=0, progress=quiet)
+    again = place_once(less, stages, options, seed=0, progress=quiet, name="unfolded")
     assert again.contradicting == 0
     assert len(again.sfm_poses) == len(found.walk.images)
+
+
+def quiet(step: str, done: int, total: int) -> None:
+    pass
+
+
+def test_two_places_that_nothing_connects_are_named(tmp_path: Path, rng: np.random.Generator) -> None:
+    rooms = [rng.uniform([x - 1.5, 2.2, 0.6], [x + 1.5, 3.6, 2.4], (220, 3)) for x in (0.0, 40.0)]
+    points = np.vstack(rooms)
+    images, seen, ids = [], [], []
+    for k, x in enumerate([*np.arange(-1.0, 1.1, 0.25), *np.arange(39.4, 40.7, 0.25)]):
+        place = looking(np.array([x, 0.05 * rng.normal(), 1.5]), np.pi / 2)
+        pixels, inside = CAMERA.project(place.inv().apply(points))
+        visible = np.flatnonzero(inside & (np.abs(points[:, 0] - x) < 10.0))
+        pixels = pixels[visible] + rng.normal(0.0, 0.3, (len(visible), 2))
+        unused = np.zeros(len(visible), np.float32)
+        seen.append(Features(pixels.astype(np.float32), unused, unused, np.zeros((len(visible), 128), np.float32)))
+        images.append(SourceImage(f"{k:03d}.jpg", Path(), CAMERA, "", f"{k:03d}", place))
+        ids.append({int(i): n for n, i in enumerate(visible)})
+    pairs = list(itertools.combinations(range(len(images)), 2))
+    matches = [
+        np.array([(ids[a][i], ids[b][i]) for i in ids[a] if i in ids[b]], np.uint32).reshape(-1, 2) for a, b in pairs
+    ]
+    found = Matched(MapSource(Path("flats"), tuple(images), None, ()), seen, pairs, matches)
+    placing = place_once(found, Stages(tmp_path, {}), MapOptions(n_threads=1), seed=0, progress=quiet)
+    assert len(placing.sfm_poses) == 9
+    (told,) = [w for w in placing.warnings if "registered" in w]
+    assert "9 of 15 images registered, without 009.jpg, 010.jpg, 011.jpg, 012.jpg, ..." in told
+    assert "6 others (009.jpg, 010.jpg, 011.jpg, 012.jpg, ...) hang together by themselves" in told
+    assert "map each by itself" in told
+    strict = MapOptions(n_threads=1, min_registered=0.7)
+    with pytest.raises(MapError, match=r"9 of 15 images registered; 6 others .* hang together by themselves; expected"):
+        place_once(found, Stages(tmp_path, {}), strict, seed=0, progress=quiet)

@@ -283,7 +283,7 @@ def image_folder(path: Path, n: int = 4) -> Path:
         (lambda p: shutil.rmtree(p / "images"), "no folder images/"),
         (lambda p: [f.unlink() for f in (p / "images").iterdir()], "no image found"),
         (lambda p: (p / "camera.toml").unlink(), "camera.toml: no such file"),
-        (lambda p: (p / "poses.txt").unlink(), "poses.txt: no such file; expected SLAM poses"),
+        (lambda p: (p / "poses.txt").unlink(), "neither poses nor depth images, and no tag's size given"),
         (lambda p: (p / "poses.txt").write_text("000 1 2\n"), "line 1"),
         (lambda p: write_tum(p / "poses.txt", [(n, Pose.identity()) for n in "abcd"]),
          r"poses\.txt: names 0 of the 4 images; expected at least 3"),

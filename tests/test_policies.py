@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from fieldkit import policies
 from fieldkit.cameras import Camera
 from fieldkit.errors import PolicyError
 from fieldkit.frames import Pose, exp
-from fieldkit.protocol import CandidateRules
+from fieldkit.protocol import CandidateRules, OcclusionRules, Protocol, Threshold
 from fieldkit.surface import RayCaster
 from fieldkit.types import Candidates, SceneMap, Surface
-from fieldkit.views import landmark_statistics, visibility
+from fieldkit.views import landmark_heat_maps, landmark_statistics, visibility
 
 CAMERA = Camera("PINHOLE", 640, 480, (552.03, 552.03, 320.0, 240.0))
 RULES = CandidateRules(max_distance_m=5.0)
@@ -128,6 +130,75 @@ def test_statistics_are_those_of_the_observing_cameras(scene_map: SceneMap) -> N
     assert (known.n_observations == 3).all()
 
 
+def test_heat_maps_say_where_in_their_images_mapping_saw_a_landmark(scene_map: SceneMap) -> None:
+    pixels = np.zeros((75, 2), np.float32)
+    seen = scene_map.observation_landmark == 7
+    pixels[seen] = [(0.5, 0.5), (639.9, 479.9), (320.0, 100.0)]
+    moved = dataclasses.replace(scene_map, observation_px=pixels)
+    heat = landmark_heat_maps(moved, np.array([7, 3, 7]))
+    assert heat.shape == (3, 8, 8)
+    expected = np.zeros((8, 8), np.float32)
+    expected[[0, 7, 1], [0, 7, 4]] = 1 / 3
+    np.testing.assert_allclose(heat[0], expected)
+    np.testing.assert_array_equal(heat[2], heat[0])
+    assert heat[1, 0, 0] == 1.0
+    np.testing.assert_allclose(heat.sum(axis=(1, 2)), 1.0)
+    assert landmark_heat_maps(moved, np.array([], np.int32)).shape == (0, 8, 8)
+
+
+def test_the_image_of_another_camera_has_cells_of_its_own_size(scene_map: SceneMap) -> None:
+    portrait = Camera("PINHOLE", 480, 640, (552.03, 552.03, 240.0, 320.0))
+    pixels = np.full((75, 2), 470.0, np.float32)
+    turned = dataclasses.replace(scene_map, image_cameras=(CAMERA, CAMERA, portrait), observation_px=pixels)
+    heat = landmark_heat_maps(turned, np.array([0]))[0]
+    assert heat[7, 5] == pytest.approx(2 / 3)
+    assert heat[5, 7] == pytest.approx(1 / 3)
+
+
+class CountingRays(RayCaster):
+    """Rays that are counted."""
+
+    count = 0
+
+    def hit_distance(self, origins: ArrayLike, directions: ArrayLike) -> np.ndarray:
+        self.count += len(np.asarray(directions))
+        return super().hit_distance(origins, directions)
+
+
+def test_one_ray_is_cast_per_landmark_and_distinct_centre(scene_map: SceneMap) -> None:
+    centres = [[0.0, 0.0, 0.0], [0.1, 0.3, 0.0], [1e-12, 0.0, 0.0]]
+    turned = [look(c, yaw) for c in centres for yaw in (-10, 0, 10, 20, 80)]
+    candidates = make_candidates(*turned)
+    plain = visibility(scene_map, candidates, rules=RULES)
+    wanted = 0
+    for rows in ((*range(5), *range(10, 15)), range(5, 10)):
+        wanted += len(np.unique(np.concatenate([plain.landmarks[i] for i in rows])))
+    rays = CountingRays(wall(1.5))
+    visibility(scene_map, candidates, rules=RULES, rays=rays, tolerance_m=0.05)
+    assert rays.count == wanted
+    assert wanted < sum(map(len, plain.landmarks)) / 2
+
+
+def test_a_map_without_surface_serves_all_rows_but_those_with_the_filter(scene_map: SceneMap) -> None:
+    protocol = protocol_with(use=(False, True))
+    utilities_by = policies.Looker(scene_map, protocol).utilities(make_candidates(look([0, 0, 0], 0)))
+    assert set(utilities_by) == {("max", False), ("random", None)}
+    policies.check_map(scene_map, protocol)
+    missing = policies.unfiltered(scene_map, protocol)
+    assert missing is not None
+    assert missing.what == "max with occlusion"
+    assert "lab.map has no surface" in missing.reason
+    with pytest.raises(PolicyError, match="has no surface"):
+        policies.check_map(scene_map, protocol_with(use=(True,)))
+    whole = dataclasses.replace(scene_map, surface=wall(1.5))
+    assert policies.unfiltered(whole, protocol) is None
+    assert policies.unfiltered(scene_map, protocol_with(use=(False,))) is None
+
+
+def protocol_with(*, use: tuple[bool, ...]) -> Protocol:
+    return Protocol("p", (Threshold(0.1, 1.0),), ("max", "random"), occlusion=OcclusionRules(use=use))
+
+
 def test_fisher_information_is_the_trace_of_the_numeric_one(scene_map: SceneMap) -> None:
     map_from_cam, sigma = look([0.3, 0.2, 0.1], 10), 1 / 552.03
 
@@ -206,3 +277,10 @@ def test_no_policy_is_given_images_estimates_or_truth() -> None:
         "candidates", "visible", "statistics",
         "visit", "view_ids", "kinds", "map_from_cam", "camera", "allowed", "forward_in_map",
     }  # fmt: skip
+
+
+def test_another_name_of_a_map_s_feature_is_that_feature(scene_map: SceneMap) -> None:
+    rules = Protocol("mine", (Threshold(0.1, 1.0),), ("forward",))
+    policies.check_map(scene_map, msgspec.structs.replace(rules, feature="rootsift"))
+    with pytest.raises(PolicyError, match="made with feature 'sift'; the protocol mine expects 'aliked'"):
+        policies.check_map(scene_map, msgspec.structs.replace(rules, feature="aliked"))

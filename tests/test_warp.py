@@ -14,8 +14,8 @@ from fieldkit.calibrate.adjustment import Corners, Landmarks, adjust, adjust_cam
 from fieldkit.calibrate.geometry import Poses
 from fieldkit.frames import Array
 from fieldkit.maps import MapWarp, map_warp
-from fieldkit.maps.warp import MIN_OBSERVATIONS
 from fieldkit.types import SceneMap
+from fieldkit.warp import MIN_OBSERVATIONS
 
 
 @pytest.fixture(scope="module")

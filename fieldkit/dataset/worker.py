@@ -279,8 +279,9 @@ def build_scene_map(source: ViewSource, path: Path, rules: DatasetRules, tell: T
             work / "mapping",
             work / path.name,
             feature=rules.feature,
-            # As many maps as workers may be made at once; the number of threads does not change a map.
-            options=maps.MapOptions(n_threads=1),
+            # As many maps as workers may be made at once; the number of threads does not change a map. A dataset's
+            # bytes repeat, and seconds do not.
+            options=maps.MapOptions(n_threads=1, keep_record=False),
             progress=lambda step, done, total: tell(f"{source.name}: map, {step}", done, total),
         )
         gauge = maps.fit_gauge(maps.load_map(work / path.name), true)

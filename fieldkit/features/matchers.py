@@ -42,7 +42,7 @@ def open_matcher(
     kind = feature_kind(feature)
     if matcher == "lightglue":
         network = LightGlue(feature, weights=weights)
-        return PairMatcher("lightglue", lambda a, m, b, n: network.match(a, m, b, n)[0], 8)
+        return PairMatcher("lightglue", lambda a, m, b, n: network.match(a, m, b, n)[0], 14)
     if matcher != "nearest":
         raise FeatureError(f"unknown matcher {matcher!r}", hint="known: nearest, lightglue")
     least = ratio if kind.matching == "ratio" else 1.0

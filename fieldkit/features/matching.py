@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
+from fieldkit.features.nearest import nearest
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
-# Queries whose products with all stored descriptors are looked at together.
-_BLOCK = 256
 
 
 def match_pair(
@@ -38,42 +37,40 @@ def match_pair(
 
 
 def match_groups(
-    query: Descriptors, stored: Descriptors, group: Ints, *, ratio: float
-) -> tuple[Ints, Ints, NDArray[np.float32]]:
+    query: Descriptors,
+    stored: Descriptors,
+    group: Ints,
+    *,
+    ratio: float = 1.0,
+    mutual: bool = False,
+    max_squared: float = np.inf,
+    threads: int = 1,
+) -> tuple[Ints, Ints, Floats]:
     """Match query descriptors (n, w) to groups (landmarks) that own several stored descriptors (m, w).
 
     The ratio test compares the best descriptor with the best one of ANOTHER group, so that a landmark seen in
-    many images does not compete with itself. Every group keeps only its nearest query. Returns query indices
-    (sorted), groups, and squared distances.
+    many images does not compete with itself. Every group keeps only its nearest query; where ``mutual``, only if no
+    other query at all is nearer. Returns query indices (sorted), groups, and squared distances of at most
+    ``max_squared``.
     """
-    empty = np.zeros(0, dtype=np.int32)
     if not len(query) or not len(stored):
+        empty = np.zeros(0, dtype=np.int32)
         return empty, empty, np.zeros(0, dtype=np.float32)
-    best, best_distance, other_distance = _nearest_blockwise(query, stored, group)
-    kept = np.flatnonzero(best_distance < np.float32(ratio * ratio) * other_distance)
-    order = kept[np.lexsort((kept, best_distance[kept], group[best[kept]]))]
-    groups = group[best[order]]
+    found = nearest(query, stored, group, threads=threads)
+    kept = np.flatnonzero((found.squared < np.float32(ratio * ratio) * found.other) & (found.squared <= max_squared))
+    order = kept[np.lexsort((kept, found.squared[kept], group[found.index[kept]]))]
+    groups = group[found.index[order]]
     first = np.ones(len(order), dtype=bool)
     first[1:] = groups[1:] != groups[:-1]
     chosen = np.sort(order[first])
-    return chosen.astype(np.int32), group[best[chosen]], best_distance[chosen]
-
-
-def _nearest_blockwise(query: Descriptors, stored: Descriptors, group: Ints) -> tuple[Ints, Floats, Floats]:
-    """Return per query the nearest stored descriptor, its squared distance, and that of the nearest of other groups.
-
-    A block of products stays in the processor's cache; the whole table would go through memory four times.
-    """
-    a, b = np.asarray(query, dtype=np.float32), np.asarray(stored, dtype=np.float32)
-    a_squares, b_squares = np.einsum("ij,ij->i", a, a), np.einsum("ij,ij->i", b, b)
-    best = np.zeros(len(a), dtype=np.int32)
-    nearest, other = np.empty(len(a), dtype=np.float32), np.empty(len(a), dtype=np.float32)
-    products = np.empty((min(_BLOCK, len(a)), len(b)), dtype=np.float32)
-    for begin in range(0, len(a), _BLOCK):
-        rows = slice(begin, min(begin + _BLOCK, len(a)))
-        block = np.matmul(a[rows], b.T, out=products[: rows.stop - begin])
-        _nearest_groups(block, a_squares[rows], b_squares, group, best[rows], nearest[rows], other[rows])
-    return best, nearest, other
+    if mutual and len(chosen):
+        matched = np.flatnonzero(np.isin(group, group[found.index[chosen]]))
+        back = nearest(stored[matched], query, np.arange(len(query), dtype=np.int32), threads=threads)
+        of_group = np.full(int(group.max()) + 1, np.inf, dtype=np.float32)
+        np.minimum.at(of_group, group[matched], back.squared)
+        # A hair of room: the two directions sum the same products in another order
+        chosen = chosen[found.squared[chosen] <= of_group[group[found.index[chosen]]] * 1.0001 + 1e-6]
+    return chosen.astype(np.int32), group[found.index[chosen]], found.squared[chosen]
 
 
 def _squared_distances(first: Descriptors, second: Descriptors) -> Floats:
@@ -167,34 +164,3 @@ def _mutual_bytes(first, second, squared_ratio):  # type: ignore[no-untyped-def]
     row_ok = row_first < squared_ratio * row_second
     column_ok = column_first < squared_ratio * column_second
     return row_best, row_ok, column_best, column_ok
-
-
-@numba.njit(cache=True, nogil=True)
-def _nearest_groups(product, row_squares, column_squares, group, best, nearest, other):  # type: ignore[no-untyped-def]
-    """Fill per row the nearest column, its distance, and the nearest distance among columns of other groups.
-
-    ``product`` holds the dot products of rows and columns.
-    """
-    n, m = product.shape
-    for i in range(n):
-        first = np.float32(np.inf)
-        second = np.float32(np.inf)
-        index = 0
-        owner = -1
-        for j in range(m):
-            d = np.float32(-2.0) * product[i, j] + row_squares[i] + column_squares[j]
-            if d < second:
-                if group[j] == owner:
-                    if d < first:
-                        first = d
-                        index = j
-                elif d < first:
-                    second = first
-                    first = d
-                    index = j
-                    owner = group[j]
-                else:
-                    second = d
-        best[i] = index
-        nearest[i] = first
-        other[i] = second

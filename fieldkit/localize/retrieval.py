@@ -53,10 +53,15 @@ def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
     return tuple(result)
 
 
-def most_similar(index: Index, descriptors: Descriptors, *, count: int) -> Ints:
-    """Return the indices of the mapping images most similar to an image with these descriptors, best first."""
-    similarity = index.vectors @ global_descriptor(index.vocabulary, descriptors)
-    return np.argsort(-similarity, kind="stable")[:count].astype(np.int32)
+def most_similar(index: Index, descriptors: Descriptors, *, count: int, among: NDArray[np.bool_] | None = None) -> Ints:
+    """Return the indices of the mapping images most similar to an image with these descriptors, best first.
+
+    Only those in ``among`` bool[k], where it is given.
+    """
+    # Summed by numpy itself: BLAS would start threads for it
+    similarity = np.einsum("kw,w->k", index.vectors, global_descriptor(index.vocabulary, descriptors))
+    order = np.argsort(-similarity, kind="stable")
+    return (order if among is None else order[among[order]])[:count].astype(np.int32)
 
 
 def _grouped(owner: Ints, count: int) -> list[NDArray[np.int64]]:

@@ -1,20 +1,33 @@
 """Maps: structure from motion, metric alignment, landmarks and surface, from images to a map folder and back."""
 
-from fieldkit.maps.build import MapOptions, MapReport, build_map
+from fieldkit.maps.build import build_map
 from fieldkit.maps.compact import compact_map
+from fieldkit.maps.exporting import Exported, export_map
 from fieldkit.maps.gauge import Gauge, fit_gauge
+from fieldkit.maps.import_frame import FrameOptions
+from fieldkit.maps.importing import ImportOptions, import_map
 from fieldkit.maps.io import content_digest, load_map, map_info
-from fieldkit.maps.warp import MapWarp, map_warp
+from fieldkit.maps.landmarks import LandmarkRules
+from fieldkit.maps.meshes import ForeignMesh
+from fieldkit.maps.options import MapOptions, MapReport
+from fieldkit.warp import MapWarp, map_warp
 
 __all__ = [
+    "Exported",
+    "ForeignMesh",
+    "FrameOptions",
     "Gauge",
+    "ImportOptions",
+    "LandmarkRules",
     "MapOptions",
     "MapReport",
     "MapWarp",
     "build_map",
     "compact_map",
     "content_digest",
+    "export_map",
     "fit_gauge",
+    "import_map",
     "load_map",
     "map_info",
     "map_warp",

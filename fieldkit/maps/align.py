@@ -12,15 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
+from fieldkit.maps.motion import Walks, motion_scale, position_sigma
 from fieldkit.maps.source import MIN_POSES
 
 Array = NDArray[np.float64]
 Verdict = Literal["pass", "warn", "fail"]
+AlignmentSource = Literal["slam", "tags", "depth", "known"]
+GravityFrom = Literal["slam", "floor", "verticals", "cameras", "known"]
 
 # Below this no camera is called an outlier, however well the others fit: SLAM and SfM both are that uncertain.
 _MIN_THRESHOLD_M = 0.05
 # Threshold in median residuals: a steady drift is kept whole, positions that are plainly wrong are left out.
 _WIDTH = 4.0
+# Steps that tell the scale less surely than this are short against their noise, which then also biases them
+_SURE = 0.005
 # Tilt between SLAM's up and the map's that is levelled; more means that one of the two is wrong.
 _MAX_LEVELLED_DEG = 5.0
 
@@ -52,10 +57,14 @@ class Alignment:
     Residuals are distances between aligned and SLAM camera centres: ``rms_m`` of those used, ``p95_m`` of all.
     ``gravity_deg`` is the median angle between the up directions of aligned and SLAM cameras, after levelling.
     ``threshold_m`` is the residual above which a SLAM position was left out; it is chosen from the drift.
+    Without SLAM positions what is counted, and the residuals, are those of ``source``: tags' corners or depths at
+    landmarks, in m; ``gravity_deg`` is the standard deviation of the direction that ``gravity_from`` tells of.
+    ``scale_sigma`` is the relative standard deviation of the scale. Of poses that were given, ``reprojection_px`` is
+    the root mean square residual in the images, and ``match_share`` how much of the matches they fit.
     """
 
     map_from_sfm: Similarity
-    source: Literal["slam", "tags", "depth", "known"]
+    source: AlignmentSource
     n_used: int
     n_total: int
     rms_m: float
@@ -63,6 +72,10 @@ class Alignment:
     gravity_deg: float
     threshold_m: float
     verdict: Verdict
+    gravity_from: GravityFrom = "slam"
+    scale_sigma: float | None = None
+    reprojection_px: float | None = None
+    match_share: float | None = None
 
 
 def umeyama(source: Array, target: Array) -> Similarity:
@@ -107,11 +120,14 @@ def robust_similarity(source: Array, target: Array, *, rng: np.random.Generator)
     return best, threshold
 
 
-def align_to_slam(sfm_from_cam: Sequence[Pose], slam_from_cam: Sequence[Pose], *, seed: int) -> Alignment:
+def align_to_slam(
+    sfm_from_cam: Sequence[Pose], slam_from_cam: Sequence[Pose], *, seed: int, walks: Walks = ()
+) -> Alignment:
     """Find the map frame: SLAM's scale, position, heading and gravity for the cameras that SfM placed.
 
     The similarity is fitted to the camera centres; then the map is levelled, so that the median up direction of
-    its cameras agrees with SLAM's, which knows gravity better than its drifting heights do.
+    its cameras agrees with SLAM's, which knows gravity better than its drifting heights do. Where ``walks``, rows of
+    images in the order in which they were taken, tell the scale more surely by their steps, it is taken from them.
     Raises MapError when fewer than three cameras have SLAM poses or they stand on one spot.
     """
     if len(sfm_from_cam) < MIN_POSES:
@@ -132,6 +148,7 @@ def align_to_slam(sfm_from_cam: Sequence[Pose], slam_from_cam: Sequence[Pose], *
     if not used.any() or similarity.scale <= 0:
         raise MapError("the SLAM positions do not fit the reconstruction", hint="check the poses")
     similarity = _levelled(similarity, source, target, used, _ups(similarity, sfm_from_cam, slam_from_cam))
+    similarity, sigma = _by_motion(similarity, sfm_from_cam, slam_from_cam, used, walks)
     residual = np.linalg.norm(similarity.points(source) - target, axis=1)
     used = residual <= threshold
     tilt = np.degrees(np.arccos(np.clip(_ups(similarity, sfm_from_cam, slam_from_cam)[:, 2], -1.0, 1.0)))
@@ -148,7 +165,31 @@ def align_to_slam(sfm_from_cam: Sequence[Pose], slam_from_cam: Sequence[Pose], *
         gravity,
         threshold,
         _verdict(share, rms / spread, gravity),
+        scale_sigma=sigma,
     )
+
+
+def _by_motion(
+    similarity: Similarity,
+    sfm_from_cam: Sequence[Pose],
+    slam_from_cam: Sequence[Pose],
+    used: NDArray[np.bool_],
+    walks: Walks,
+) -> tuple[Similarity, float | None]:
+    """Return the similarity with the scale of the walks' steps where that is surer than that of the positions."""
+    kept = [[i for i in walk if used[i]] for walk in walks]
+    found = motion_scale(sfm_from_cam, slam_from_cam, kept)
+    if found is None:
+        return similarity, None
+    source = np.stack([p.translation for p in sfm_from_cam])
+    target = np.stack([p.translation for p in slam_from_cam])
+    placed = similarity.points(source)
+    by_position = position_sigma(placed, target - placed, kept)
+    scale, sigma = found
+    if by_position < sigma or sigma > _SURE:
+        return similarity, by_position
+    middle = similarity.rotation.apply(source[used]).mean(axis=0)
+    return Similarity(scale, similarity.rotation, target[used].mean(axis=0) - scale * middle), sigma
 
 
 def _ups(similarity: Similarity, sfm_from_cam: Sequence[Pose], slam_from_cam: Sequence[Pose]) -> Array:

@@ -3,111 +3,51 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import cast
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
-from fieldkit.features import Features, feature_name, open_extractor, read_image
-from fieldkit.features.matchers import MatcherName, open_matcher
+from fieldkit.features import Extractor, Features, feature_name, open_extractor
+from fieldkit.features.matchers import PairMatcher, open_matcher
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity, align_to_slam
+from fieldkit.maps.align import Alignment, Similarity
+from fieldkit.maps.checking import check_images, content
+from fieldkit.maps.framing import look_for_tags, refuse_unscaled
 from fieldkit.maps.io import (
     AlignmentEntry,
     MapFile,
     SurfaceEntry,
     content_digest,
-    positive,
     write_features,
     write_map_file,
 )
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
-from fieldkit.maps.metric import depth_scale, depth_views, with_depth_scale
+from fieldkit.maps.metric import depth_views
+from fieldkit.maps.options import MapOptions, MapReport, Progress
 from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
-from fieldkit.maps.plausible import SlamRules, plausible_matches, plausible_pairs
-from fieldkit.maps.sfm import reconstruct, relative_poses, threads
-from fieldkit.maps.source import DepthFrame, MapSource, read_source
-from fieldkit.maps.strays import contradicting, strays
-from fieldkit.store import atomic_folder
+from fieldkit.maps.placing import Matched, place_images
+from fieldkit.maps.plausible import plausible_matches
+from fieldkit.maps.record import write_record
+from fieldkit.maps.sfm import threads
+from fieldkit.maps.source import MapSource, SourceImage, read_depth, read_image, without_poses
+from fieldkit.maps.stages import Stages, resumed, shares
+from fieldkit.maps.strays import strays
+from fieldkit.maps.streamrecorder import open_source
+from fieldkit.store import atomic_folder, digest, library_versions
 from fieldkit.store.files import refuse_existing
-from fieldkit.surface import fuse_depth, write_ply
+from fieldkit.surface import fuse_depth, read_ply, write_ply
 from fieldkit.types import Surface
 
-Progress = Callable[[str, int, int], None]
-
-# A few misplaced images are left out; of more than this share the rest is bent too, and SfM starts again.
-_FOLDED = 0.05
-
-
-@dataclasses.dataclass(frozen=True)
-class MapOptions:
-    """Settings of map building; the defaults suit 50..500 images of rooms.
-
-    ``scale`` "auto" refines the scale of the SLAM poses by the depth images where there are any; "slam" does not.
-    ``n_similar`` is to how many similar images every image is matched, by default what the matcher is fast enough for.
-    ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches. ``weights`` is a folder
-    where networks' weights are looked for first. ``n_threads`` is by default the number of processors; it does not
-    change the map. Neither is a part of what the options are told by.
-    Raises MapError when a length or a count is not positive.
-    """
-
-    max_keypoints: int = 2048
-    max_image_size: int | None = 1600
-    matcher: MatcherName = "nearest"
-    ratio: float = 0.8
-    n_similar: int | None = None
-    n_neighbours: int = 3
-    min_registered: float = 0.5
-    landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
-    scale: Literal["auto", "slam"] = "auto"
-    slam: SlamRules | None = dataclasses.field(default_factory=SlamRules)
-    voxel_m: float = 0.04
-    truncation_voxels: float = 3.5
-    max_depth_m: float = 6.0
-    weights: Path | None = dataclasses.field(default=None, repr=False, compare=False)
-    n_threads: int | None = dataclasses.field(default=None, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        for name in ("voxel_m", "truncation_voxels", "max_depth_m", "ratio", "max_keypoints"):
-            positive(name, getattr(self, name))
-        if self.n_threads is not None:
-            positive("n_threads", self.n_threads)
-
-
-@dataclasses.dataclass(frozen=True)
-class MapReport:
-    """What became of a SOURCE: counts, alignment, seconds per step, and what a user should know."""
-
-    path: str
-    digest: str
-    n_images: int
-    n_registered: int
-    n_landmarks: int
-    alignment: Alignment
-    has_surface: bool
-    seconds: Mapping[str, float]
-    warnings: tuple[str, ...]
-
-
-class _Clock:
-    """Seconds per step."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, step: str) -> None:
-        now = time.perf_counter()
-        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
-        self._last = now
+# Pairs whose matches are kept together: what a killed process loses at most
+_SHARE = 500
 
 
 def build_map(
@@ -122,60 +62,69 @@ def build_map(
 ) -> MapReport:
     """Build a map folder from a rig folder or an image folder: features, SfM, metric frame, landmarks, surface.
 
-    SfM starts from the images; SLAM poses only rule out matches between places that look alike. They give scale, frame
-    and gravity afterwards, and depth images refine the scale.
-    The same source and seed give the same map, whatever the number of processors.
+    SfM starts from the images; SLAM poses only rule out matches between places that look alike. What gives scale,
+    frame and gravity afterwards is for ``options`` to say; poses that are known are taken as they are.
+    The same source and seed give the same map, whatever the number of processors, and however often the build was
+    killed: finished stages are kept in ``.<out>.building`` beside ``out``, and the same command goes on from them.
     ``progress(step, done, total)`` is called along the way. Raises MapError when the source is incomplete, too few
-    images register, or the poses do not fit, and StoreError when ``out`` is in the way; nothing is left behind.
+    images register, or nothing gives a metric frame, and StoreError when ``out`` is in the way; nothing is left behind.
     """
-    options = MapOptions() if options is None else options
+    options, out = MapOptions() if options is None else options, Path(out)
     tell: Progress = progress or (lambda step, done, total: None)
     feature = feature_name(feature)
-    refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
-    clock = _Clock()
-    walk = read_source(Path(source))
-    features = _extract_all(walk, feature, options, tell)
-    clock.lap("extract")
-    pairs, matches, disbelieved = _match_all(walk, features, feature, options, seed, tell)
-    clock.lap("match")
-    found = _Matched(walk, features, pairs, matches)
-    placing = _place(found, options, seed, tell)
-    if options.slam is not None and not disbelieved and placing.contradicting > _FOLDED * len(placing.sfm_poses):
-        again = _place(_unfolded(found, options.slam, options, seed), options, seed, tell)
-        placing = max(placing, again, key=lambda p: len(p.sfm_poses) - p.contradicting)
-    clock.lap("reconstruct")
-    model, sfm_poses, alignment, warnings = placing.model, placing.sfm_poses, placing.alignment, placing.warnings
-    mapped, left_out = _placed(walk, model, sfm_poses, alignment)
-    n_landmarks = _finish_model(walk, model, alignment.map_from_sfm, options.landmarks)
-    clock.lap("align")
-    surface, missing = _surface(walk, mapped, options, tell)
-    clock.lap("surface")
-    counts = (len(walk.images), len(mapped), n_landmarks)
-    with atomic_folder(Path(out), force=force, marker="map.toml") as folder:
-        _write(folder, walk, model, features, mapped, surface)
-        digest = content_digest(folder)
-        places = _alignment_entry(alignment), _surface_entry(surface, options)
-        write_map_file(folder, MapFile(1, digest, feature, *counts, *places))
-    clock.lap("write")
-    told = (*disbelieved, *warnings, *left_out, *missing)
-    return MapReport(str(out), digest, *counts, alignment, surface is not None, clock.seconds, told)
-
-
-def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progress) -> list[Features]:
+    refuse_existing(out, force=force, marker="map.toml", kind="folder")
+    walk = open_source(Path(source))
+    refuse_unscaled(walk, options)
+    check_images(walk)
     extractor = open_extractor(
         feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
     )
+    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
+    walk = without_poses(walk) if options.poses == "none" else walk
+    versions = library_versions()
+    key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
+    with resumed(out, key) as stages:
+        with stages.timed("tags"):
+            tags = look_for_tags(walk, options, progress=tell)
+        with stages.timed("extract"):
+            features = _extract_all(walk, extractor, stages, options, tell)
+        with stages.timed("match"):
+            found = _match_all(walk, features, matcher, stages, options, seed, tell)
+        placing = place_images(dataclasses.replace(found, tags=tags), stages, options, seed=seed, progress=tell)
+        with stages.timed("align"):
+            model, alignment = placing.model, placing.alignment
+            mapped, left_out = _placed(walk, model, placing.sfm_poses, alignment)
+            n_landmarks = _finish_model(walk, model, alignment.map_from_sfm, options.landmarks)
+        with stages.timed("surface"):
+            surface, missing = _surface(walk, mapped, stages, options, tell)
+        counts = (len(walk.images), len(mapped), n_landmarks)
+        told = (*walk.notes, *found.disbelieved, *placing.warnings, *left_out, *missing)
+        with stages.timed("write"), atomic_folder(out, force=force, marker="map.toml") as folder:
+            _write(folder, walk, model, features, mapped, surface)
+            made = content_digest(folder)
+            places = alignment_entry(alignment), _surface_entry(surface, options)
+            write_map_file(folder, MapFile(1, made, feature, *counts, *places))
+            if options.keep_record:
+                write_record(folder, dict(stages.seconds), versions=versions, options=repr(options), told=told)
+    return MapReport(str(out), made, *counts, alignment, surface is not None, dict(stages.seconds), told)
+
+
+def _extract_all(
+    walk: MapSource, extractor: Extractor, stages: Stages, options: MapOptions, tell: Progress
+) -> list[Features]:
+    def make(image: SourceImage) -> dict[str, NDArray[np.generic]]:
+        found = extractor.extract(read_image(image, colour=extractor.kind.colour))
+        return {
+            "keypoints": found.keypoints_px,
+            "scores": found.scores,
+            "scales": found.scales,
+            "descriptors": found.descriptors,
+        }
 
     def one(index: int) -> Features:
-        image = walk.images[index]
-        pixels = read_image(image.file, colour=extractor.kind.colour)
-        if pixels.shape[:2] != (image.camera.height, image.camera.width):
-            raise MapError(
-                f"{image.file}: is {pixels.shape[1]}x{pixels.shape[0]}; its camera says "
-                f"{image.camera.width}x{image.camera.height}",
-                hint="give every camera images of one size",
-            )
-        return extractor.extract(pixels)
+        stored = stages.arrays(f"features/{index:06d}", lambda: make(walk.images[index]))
+        keypoints, scores, scales = (stored[name].astype(np.float32) for name in ("keypoints", "scores", "scales"))
+        return Features(keypoints, scores, scales, cast(NDArray[np.uint8], stored["descriptors"]))
 
     found = []
     with ThreadPoolExecutor(options.n_threads or threads()) as pool:
@@ -186,143 +135,63 @@ def _extract_all(walk: MapSource, feature: str, options: MapOptions, tell: Progr
 
 
 def _match_all(
-    walk: MapSource, features: list[Features], feature: str, options: MapOptions, seed: int, tell: Progress
-) -> tuple[list[Pair], list[NDArray[np.uint32]], list[str]]:
-    """Return pairs, their matches as far as SLAM's poses allow them, and a warning where SLAM is not believed."""
-    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
+    walk: MapSource,
+    features: list[Features],
+    matcher: PairMatcher,
+    stages: Stages,
+    options: MapOptions,
+    seed: int,
+    tell: Progress,
+) -> Matched:
+    """Match the chosen pairs of images and keep what SLAM's poses allow; say so where SLAM is not believed."""
     n_similar = matcher.n_similar if options.n_similar is None else options.n_similar
-    pairs = choose_pairs(walk.images, features, seed=seed, n_similar=n_similar, n_neighbours=options.n_neighbours)
-    matches = match_pairs(
-        pairs,
-        features,
-        sizes=[(image.camera.width, image.camera.height) for image in walk.images],
-        matcher=matcher,
-        progress=lambda n: tell("match", n, len(pairs)),
-        n_threads=options.n_threads or threads(),
-    )
-    if options.slam is None:
-        return pairs, matches, []
-    plausible = plausible_matches(walk.images, features, pairs, matches, rules=options.slam)
-    share = sum(map(len, plausible)) / max(sum(map(len, matches)), 1)
+    chosen = stages.arrays(
+        "pairs",
+        lambda: {
+            "pairs": np.array(
+                choose_pairs(walk.images, features, seed=seed, n_similar=n_similar, n_neighbours=options.n_neighbours),
+                dtype=np.int64,
+            ).reshape(-1, 2)
+        },
+    )["pairs"]
+    pairs: list[Pair] = [(int(a), int(b)) for a, b in chosen]
+    matches: list[NDArray[np.uint32]] = []
+    for number, share in shares(pairs, _SHARE):
+        before = len(matches)
+
+        def told(done: int, before: int = before) -> None:
+            tell("match", before + done, len(pairs))
+
+        make = functools.partial(_matched, walk, share, features, matcher, told, options.n_threads or threads())
+        stored = stages.arrays(f"matches/{number:06d}", make)
+        borders = np.concatenate([[0], np.cumsum(stored["count"].astype(np.int64))])
+        matches += [stored["matches"][a:b].astype(np.uint32) for a, b in itertools.pairwise(borders)]
+        tell("match", len(matches), len(pairs))
+    found = Matched(walk, features, pairs, matches)
+    return found if options.slam is None else _plausible(found, options)
+
+
+def _matched(
+    walk: MapSource,
+    pairs: Sequence[Pair],
+    features: list[Features],
+    matcher: PairMatcher,
+    tell: Callable[[int], None],
+    n_threads: int,
+) -> dict[str, NDArray[np.generic]]:
+    sizes = [(image.camera.width, image.camera.height) for image in walk.images]
+    made = match_pairs(pairs, features, sizes=sizes, matcher=matcher, progress=tell, n_threads=n_threads)
+    return {"count": np.array([len(m) for m in made]), "matches": np.concatenate(made)}
+
+
+def _plausible(found: Matched, options: MapOptions) -> Matched:
+    assert options.slam is not None
+    plausible = plausible_matches(found.walk.images, found.features, found.pairs, found.matches, rules=options.slam)
+    share = sum(map(len, plausible)) / max(sum(map(len, found.matches)), 1)
     if share < options.slam.least_share:
-        return pairs, matches, [f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"]
-    return pairs, plausible, []
-
-
-@dataclasses.dataclass(frozen=True)
-class _Matched:
-    """What SfM starts from."""
-
-    walk: MapSource
-    features: Sequence[Features]
-    pairs: Sequence[Pair]
-    matches: Sequence[NDArray[np.uint32]]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Placing:
-    """A model with its poses sfm_from_cam, its alignment, and how many images are not where SLAM saw them."""
-
-    model: pycolmap.Reconstruction
-    sfm_poses: Mapping[int, Pose]
-    alignment: Alignment
-    warnings: Sequence[str]
-    contradicting: int
-
-
-def _place(found: _Matched, options: MapOptions, seed: int, tell: Progress) -> _Placing:
-    walk = found.walk
-    model = reconstruct(
-        walk.images,
-        found.features,
-        found.pairs,
-        found.matches,
-        seed=seed,
-        progress=tell,
-        n_threads=options.n_threads or threads(),
-    )
-    poses = _registered(walk, model, options)
-    alignment, warnings = _align(walk, model, poses, options, seed)
-    mapped = {i: alignment.map_from_sfm.pose(p) for i, p in poses.items()}
-    far = contradicting(walk.images, mapped, threshold_m=alignment.threshold_m)
-    return _Placing(model, poses, alignment, warnings, len(far))
-
-
-def _unfolded(found: _Matched, rules: SlamRules, options: MapOptions, seed: int) -> _Matched:
-    """Leave out the pairs of images whose own relative poses contradict SLAM's."""
-    relative = relative_poses(
-        found.walk.images,
-        found.features,
-        found.pairs,
-        found.matches,
-        seed=seed,
-        n_threads=options.n_threads or threads(),
-    )
-    kept = plausible_pairs(found.walk.images, found.pairs, relative, rules=rules)
-    return dataclasses.replace(
-        found,
-        pairs=list(itertools.compress(found.pairs, kept)),
-        matches=list(itertools.compress(found.matches, kept)),
-    )
-
-
-def _registered(walk: MapSource, model: pycolmap.Reconstruction, options: MapOptions) -> dict[int, Pose]:
-    """Return sfm_from_cam by image index; raises MapError when too few images are in the model."""
-    poses = {}
-    for image_id in model.reg_image_ids():
-        matrix = np.vstack([model.image(image_id).cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
-        poses[image_id - 1] = Pose.from_matrix(matrix).inv()
-    if len(poses) < max(3, options.min_registered * len(walk.images)):
-        raise MapError(
-            f"{walk.path}: {len(poses)} of {len(walk.images)} images registered; expected at least half, and 3",
-            hint="map in one connected walk with overlapping sharp images; check images and cameras of the others",
-        )
-    return dict(sorted(poses.items()))
-
-
-def _align(
-    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], options: MapOptions, seed: int
-) -> tuple[Alignment, list[str]]:
-    """Return map_from_sfm by the SLAM poses, scaled by depth unless told otherwise, and what a user should know."""
-    posed = {i: p for i in sfm_poses if (p := walk.images[i].slam_from_cam) is not None}
-    try:
-        alignment = align_to_slam([sfm_poses[i] for i in posed], list(posed.values()), seed=seed)
-    except MapError as error:
-        raise MapError(f"{walk.path}: {error.message}", hint=error.hint) from error
-    warnings = []
-    if len(sfm_poses) < len(walk.images):
-        warnings.append(f"{len(sfm_poses)} of {len(walk.images)} images registered")
-    if alignment.verdict != "pass":
-        warnings.append(
-            f"alignment verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} SLAM poses within "
-            f"{alignment.threshold_m:.3f} m, rms {alignment.rms_m:.3f} m, gravity {alignment.gravity_deg:.2f} deg"
-        )
-    if options.scale == "slam":
-        return alignment, warnings
-    scaled, doubts = _scale_by_depth(walk, model, sfm_poses, alignment)
-    return scaled, warnings + doubts
-
-
-def _scale_by_depth(
-    walk: MapSource, model: pycolmap.Reconstruction, sfm_poses: Mapping[int, Pose], alignment: Alignment
-) -> tuple[Alignment, list[str]]:
-    """Take the metric scale from the depth images where there are any; SLAM's drift is in its scale."""
-    if walk.depth_camera is None:
-        return alignment, []
-    arrays, similarity = model_arrays(model), alignment.map_from_sfm
-    scaled = dataclasses.replace(arrays, xyz=similarity.points(arrays.xyz))
-    mapped = {i: similarity.pose(p) for i, p in sfm_poses.items()}
-    size = (walk.depth_camera.width, walk.depth_camera.height)
-    found = depth_scale(walk, scaled, mapped, read=lambda frame: _DepthReader(frame, *size)())
-    if found is None:
-        return alignment, []
-    posed = {i: p for i in sfm_poses if (p := walk.images[i].slam_from_cam) is not None}
-    return with_depth_scale(
-        alignment,
-        found,
-        sfm_centres=np.stack([sfm_poses[i].translation for i in posed]),
-        slam_centres=np.stack([p.translation for p in posed.values()]),
-    )
+        told = f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"
+        return dataclasses.replace(found, disbelieved=(told,))
+    return dataclasses.replace(found, matches=plausible)
 
 
 def _placed(
@@ -364,16 +233,17 @@ def _finish_model(
 
 
 def _surface(
-    walk: MapSource, mapped: Mapping[int, Pose], options: MapOptions, tell: Progress
+    walk: MapSource, mapped: Mapping[int, Pose], stages: Stages, options: MapOptions, tell: Progress
 ) -> tuple[Surface | None, list[str]]:
     if walk.depth_camera is None:
         return None, ["no depth images: the map has no surface, and occlusion cannot be computed"]
     camera, views = walk.depth_camera, []
     for frame, map_from_depth in depth_views(walk, mapped):
-        views.append((map_from_depth, _DepthReader(frame, camera.width, camera.height)))
+        views.append((map_from_depth, lambda frame=frame: read_depth(frame, camera)))
     if not views:
         return None, ["no depth image belongs to a registered image: the map has no surface"]
-    try:
+
+    def fuse(path: Path) -> None:
         surface = fuse_depth(
             views,
             camera,
@@ -382,25 +252,12 @@ def _surface(
             max_depth_m=options.max_depth_m,
             progress=lambda n: tell("surface", n, len(views)),
         )
+        write_ply(path, surface)
+
+    try:
+        return read_ply(stages.put("surface.ply", fuse)), []
     except SurfaceError as error:
         raise SurfaceError(f"{walk.path / 'depth'}: {error.message}", hint=error.hint) from error
-    return surface, []
-
-
-@dataclasses.dataclass(frozen=True)
-class _DepthReader:
-    frame: DepthFrame
-    width: int
-    height: int
-
-    def __call__(self) -> NDArray[np.uint16]:
-        depth = cv2.imread(str(self.frame.file), cv2.IMREAD_UNCHANGED)
-        if depth is None or depth.dtype != np.uint16 or depth.shape != (self.height, self.width):
-            raise SurfaceError(
-                f"{self.frame.file}: expected a 16-bit PNG of {self.width}x{self.height} in mm",
-                hint="check the depth image and the depth camera's size",
-            )
-        return np.asarray(depth, dtype=np.uint16)
 
 
 def _write(
@@ -423,9 +280,21 @@ def _write(
         write_ply(folder / "surface.ply", surface)
 
 
-def _alignment_entry(a: Alignment) -> AlignmentEntry:
+def alignment_entry(a: Alignment) -> AlignmentEntry:
+    """Return [alignment] of map.toml."""
     return AlignmentEntry(
-        a.source, a.map_from_sfm.scale, a.n_used, a.n_total, a.rms_m, a.p95_m, a.gravity_deg, a.verdict
+        a.source,
+        a.map_from_sfm.scale,
+        a.n_used,
+        a.n_total,
+        a.rms_m,
+        a.p95_m,
+        a.gravity_deg,
+        a.verdict,
+        scale_sigma=a.scale_sigma,
+        gravity_from=a.gravity_from,
+        reprojection_px=a.reprojection_px,
+        match_share=a.match_share,
     )
 
 

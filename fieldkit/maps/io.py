@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -10,13 +11,13 @@ from typing import Any, Literal
 import h5py
 import msgspec
 import numpy as np
-import pycolmap
-from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, suggestion
 from fieldkit.features import FEATURES, Features
-from fieldkit.maps.landmarks import landmark_covariance, model_arrays
-from fieldkit.maps.sfm import quiet_colmap
+from fieldkit.maps.colmap import read_model
+from fieldkit.maps.descriptors import read_landmark_descriptors
+from fieldkit.maps.landmarks import landmark_covariance
+from fieldkit.maps.record import read_record
 from fieldkit.store import digest, read_toml, write_toml
 from fieldkit.surface import read_ply
 from fieldkit.types import SceneMap, Surface
@@ -35,6 +36,10 @@ class AlignmentEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     p95_m: float
     gravity_deg: float
     verdict: Literal["pass", "warn", "fail"]
+    scale_sigma: float | None = None
+    gravity_from: Literal["slam", "floor", "verticals", "cameras", "known"] | None = None
+    reprojection_px: float | None = None
+    match_share: float | None = None
 
 
 class SurfaceEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -75,34 +80,6 @@ def write_features(
             group.create_dataset("image_size", data=np.array(sizes[name], dtype=np.int32))
 
 
-def read_features(path: Path, names: tuple[str, ...]) -> dict[str, tuple[NDArray[np.float32], NDArray[Any]]]:
-    """Read keypoints (n, 2) in COLMAP pixels and descriptors (n, w) per image name from an hloc features.h5.
-
-    Raises MapError when the file or an image's entry is missing or damaged.
-    """
-    result = {}
-    try:
-        with h5py.File(path, "r") as file:
-            for name in names:
-                if name not in file:
-                    raise MapError(
-                        f"{path}: no features of {name}", hint="the file belongs to another map; build the map again"
-                    )
-                keypoints = np.asarray(file[name]["keypoints"], dtype=np.float32) + np.float32(0.5)
-                descriptors = np.asarray(file[name]["descriptors"])
-                if descriptors.ndim != 2 or descriptors.shape[1] != len(keypoints):
-                    raise MapError(
-                        f"{path}: {name}: {len(keypoints)} keypoints, descriptors {descriptors.shape}; expected (w, n)",
-                        hint="build the map again",
-                    )
-                result[name] = keypoints, np.ascontiguousarray(descriptors.T)
-    except (OSError, KeyError) as error:
-        raise MapError(
-            f"{path}: cannot be read: {error}; expected features as hloc writes them", hint="build the map again"
-        ) from error
-    return result
-
-
 def positive(name: str, value: float) -> None:
     """Raise MapError unless a setting is a finite number above zero."""
     if not (math.isfinite(value) and value > 0):
@@ -126,9 +103,21 @@ def read_map_file(path: Path) -> MapFile:
         raise MapError(f"{path}: no such folder; expected a map folder", hint="build one with `fieldkit map build`")
     if not (path / "map.toml").is_file():
         raise MapError(f"{path}: no map.toml in it; expected a map folder", hint="build one with `fieldkit map build`")
+    _refuse_old(path / "map.toml")
     entry = read_toml(path / "map.toml", MapFile, what="map.toml of fieldkit")
     _refuse_wrong_numbers(path / "map.toml", entry)
     return entry
+
+
+def _refuse_old(path: Path) -> None:
+    """Raise MapError for a map.toml of an older version than any that is read; newer ones `read_toml` refuses."""
+    try:
+        version = tomllib.loads(path.read_text(encoding="utf-8")).get("version")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return
+    if not isinstance(version, int) or version < 1:
+        found = "has no version" if version is None else f"version {version!r}"
+        raise MapError(f"{path}: {found}; this fieldkit reads version 1", hint="build or import the map again")
 
 
 def _refuse_wrong_numbers(path: Path, entry: MapFile) -> None:
@@ -148,28 +137,18 @@ def _refuse_wrong_numbers(path: Path, entry: MapFile) -> None:
 def load_map(path: Path) -> SceneMap:
     """Load a map folder: landmarks with covariance, who saw them, their descriptors, and the surface if it has one.
 
+    Of a map with millions of observations every landmark keeps the descriptors of its most different views.
     Raises MapError when a file is missing, damaged or changed, or the map's feature is unknown here.
     """
     path = Path(path)
     entry = read_map_file(path)
     if entry.feature not in FEATURES:
         raise MapError(f"{path}: built with feature {entry.feature!r}", hint=suggestion(entry.feature, list(FEATURES)))
-    _refuse_changed(path, entry)
-    model = model_arrays(read_model(path / "sparse"))
-    stored = read_features(path / "features.h5", model.image_names)
-    rows = [
-        stored[name][1][model.observation_keypoint[model.observation_image == i]]
-        for i, name in enumerate(model.image_names)
-    ]
+    refuse_changed(path, entry)
+    model = read_model(path / "sparse")
     width = FEATURES[entry.feature].width
-    descriptors = np.concatenate(rows) if rows else np.zeros((0, width), dtype=np.uint8)
-    if descriptors.shape[1] != width:
-        raise MapError(
-            f"{path / 'features.h5'}: descriptors of width {descriptors.shape[1]}; {entry.feature!r} has {width}",
-            hint="the file belongs to another feature",
-        )
-    # A compact map keeps one descriptor per landmark; the others are zero.
-    filled = descriptors.any(axis=1)
+    descriptors, rows = read_landmark_descriptors(path / "features.h5", model, width=width)
+    every = len(rows) == len(model.observation_landmark)
     return SceneMap(
         path=str(path),
         digest=entry.digest,
@@ -184,14 +163,14 @@ def load_map(path: Path) -> SceneMap:
         observation_landmark=model.observation_landmark,
         observation_image=model.observation_image,
         observation_px=model.observation_px,
-        descriptors=descriptors[filled],
-        descriptor_landmark=model.observation_landmark[filled],
-        descriptor_image=model.observation_image[filled],
+        descriptors=descriptors,
+        descriptor_landmark=model.observation_landmark if every else model.observation_landmark[rows],
+        descriptor_image=model.observation_image if every else model.observation_image[rows],
         surface=_read_surface(path, entry.surface),
     )
 
 
-def _refuse_changed(path: Path, entry: MapFile) -> None:
+def refuse_changed(path: Path, entry: MapFile) -> None:
     """Raise MapError when files are missing or are not those that map.toml's digest was made of.
 
     COLMAP may read a cut-off model without an error, and results name the digest as what they were made with.
@@ -214,17 +193,6 @@ def _refuse_changed(path: Path, entry: MapFile) -> None:
         )
 
 
-def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a COLMAP model (binary or text); raises MapError when it is missing or damaged."""
-    try:
-        with quiet_colmap():
-            return pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, OSError, LookupError) as error:
-        raise MapError(
-            f"{folder}: no readable COLMAP model; expected {', '.join(_MODEL_FILES)}", hint="build the map again"
-        ) from error
-
-
 def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
     """Return the surface; its voxel size is that of the digested mesh file, with which map.toml has to agree."""
     if entry is None:
@@ -240,8 +208,10 @@ def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
 
 
 def map_info(path: Path) -> dict[str, Any]:
-    """Return what map.toml says of a map, as plain values, with its path."""
-    return {"path": str(path), **msgspec.to_builtins(read_map_file(path))}
+    """Return what map.toml says of a map, as plain values, with its path, and how it was built where that is kept."""
+    entry, record = read_map_file(path), read_record(Path(path))
+    built = {} if record is None else {"seconds": record.seconds, "versions": record.versions}
+    return {"path": str(path), **msgspec.to_builtins(entry), **built}
 
 
 def write_map_file(path: Path, entry: MapFile) -> None:

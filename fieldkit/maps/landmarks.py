@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
-from fieldkit.types import SceneMap
+from fieldkit.observations import PRIOR_M, observations_of, projection_jacobian, reprojection_errors
 
 Array = NDArray[np.float64]
 
-# Keeps a landmark that is seen along one ray finite
-PRIOR_M = 10.0
+_INVERTED_TOGETHER = 1 << 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,17 +115,6 @@ def _camera(camera: pycolmap.Camera) -> Camera:
     return Camera(camera.model_name, camera.width, camera.height, tuple(float(v) for v in camera.params))
 
 
-def reprojection_errors(model: Model | SceneMap) -> Array:
-    """Return the distance (px) between every observation and its projected landmark; inf behind the camera."""
-    errors = np.full(len(model.observation_image), np.inf)
-    for i, rows in observations_of(model.observation_image, len(model.image_names)):
-        x_in_cam = model.map_from_image[i].inv().apply(model.xyz[model.observation_landmark[rows]])
-        pixels, _ = model.image_cameras[i].project(x_in_cam)
-        distance = np.linalg.norm(pixels - model.observation_px[rows], axis=1)
-        errors[rows] = np.where(np.isfinite(distance), distance, np.inf)
-    return errors
-
-
 def good_landmarks(model: Model, rules: LandmarkRules) -> NDArray[np.bool_]:
     """Return bool[n]: the points that pass the filter."""
     n = len(model.xyz)
@@ -166,23 +154,8 @@ def landmark_covariance(
     for i, rows in observations_of(observation_image, len(map_from_image)):
         jacobian = projection_jacobian(xyz[observation_landmark[rows]], map_from_image[i], image_cameras[i])
         np.add.at(information, observation_landmark[rows], np.einsum("nki,nkj->nij", jacobian, jacobian) / noise_px**2)
-    return np.asarray(np.linalg.inv(information))
-
-
-def projection_jacobian(xyz: Array, map_from_cam: Pose, camera: Camera) -> Array:
-    """Return f64[n, 2, 3]: derivative of the undistorted pixel by the point in the map."""
-    cam_from_map = map_from_cam.inv()
-    x, y, z = cam_from_map.apply(xyz).T
-    z = np.maximum(z, 1e-3)
-    fx, fy = camera.focal_px
-    zero = np.zeros_like(z)
-    inner = np.stack(
-        [np.stack([fx / z, zero, -fx * x / z**2], axis=1), np.stack([zero, fy / z, -fy * y / z**2], axis=1)], axis=1
-    )
-    return np.asarray(inner @ cam_from_map.rotation.as_matrix())
-
-
-def observations_of(observation_image: NDArray[np.int32], count: int) -> list[tuple[int, slice]]:
-    """Return (image, its rows) for observations that are sorted by image."""
-    bounds = np.searchsorted(observation_image, np.arange(count + 1))
-    return [(i, slice(int(bounds[i]), int(bounds[i + 1]))) for i in range(count) if bounds[i] < bounds[i + 1]]
+    # In parts and in place: of a million landmarks two copies are a seventh of a gigabyte
+    for begin in range(0, len(xyz), _INVERTED_TOGETHER):
+        part = slice(begin, begin + _INVERTED_TOGETHER)
+        information[part] = np.linalg.inv(information[part])
+    return information

@@ -27,11 +27,18 @@ _FLAT = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class DepthScale:
-    """Measured depth over mapped depth: median ratio over n landmarks, and the standard deviation of that median."""
+    """Measured depth over mapped depth: median ratio over n landmarks, and the standard deviation of that median.
+
+    ``n_used`` of them are within three standard deviations; ``rms_m`` of those and ``p95_m`` of all are how far
+    measured and mapped depth differ after scaling, in m.
+    """
 
     ratio: float
     sigma: float
     n: int
+    n_used: int = 0
+    rms_m: float = 0.0
+    p95_m: float = 0.0
 
 
 def depth_views(walk: MapSource, mapped: Mapping[int, Pose]) -> list[tuple[DepthFrame, Pose]]:
@@ -62,42 +69,58 @@ def depth_scale(walk: MapSource, model: Model, mapped: Mapping[int, Pose], *, re
         if seen:
             xyz = model.xyz[np.unique(np.concatenate(seen))]
             ratios.append(_ratios(xyz, map_from_depth, camera, read(frame)))
-    values = np.concatenate(ratios) if ratios else np.zeros(0)
+    values, measured = np.concatenate(ratios, axis=1) if ratios else np.zeros((2, 0))
     if len(values) < _MIN_SAMPLES:
         return None
     ratio = float(np.median(values))
     spread = 1.4826 * float(np.median(np.abs(values - ratio)))
-    return DepthScale(ratio, 1.2533 * spread / float(np.sqrt(len(values))), len(values))
+    off = np.abs(measured - ratio * measured / values)
+    used = np.abs(values - ratio) <= 3.0 * max(spread, 1e-9)
+    return DepthScale(
+        ratio,
+        1.2533 * spread / float(np.sqrt(len(values))) / ratio,
+        len(values),
+        int(used.sum()),
+        float(np.sqrt(np.mean(off[used] ** 2))),
+        float(np.percentile(off, 95)),
+    )
 
 
 def with_depth_scale(
-    alignment: Alignment, found: DepthScale, *, sfm_centres: Array, slam_centres: Array
+    alignment: Alignment, found: DepthScale, *, sfm_centres: Array, slam_centres: Array, anyway: bool = False
 ) -> tuple[Alignment, list[str]]:
-    """Scale an alignment about the middle of its cameras; one that depth contradicts is kept, with a warning.
+    """Scale an alignment by depth; one that depth contradicts is kept, with a warning, unless scaled ``anyway``.
 
     ``sfm_centres`` and ``slam_centres`` are the same camera centres (n, 3) in SfM's frame and as SLAM tracked them;
     frame and gravity stay SLAM's, and the residuals are those to its positions after scaling.
     """
+    told = []
     if abs(found.ratio - 1.0) > _MAX_CHANGE:
-        return alignment, [
+        told = [
             f"depth images say that the map is {100 * (found.ratio - 1):+.1f} % off in scale ({found.n} landmarks); "
-            "the SLAM scale is kept: check the units and the calibration of both"
+            f"the {'depth' if anyway else 'SLAM'} scale is kept: check the units and the calibration of both"
         ]
+        if not anyway:
+            return alignment, told
+    scaled = rescaled(alignment, found.ratio, sfm_centres=sfm_centres, slam_centres=slam_centres)
+    return dataclasses.replace(scaled, source="depth", scale_sigma=found.sigma), told
+
+
+def rescaled(alignment: Alignment, ratio: float, *, sfm_centres: Array, slam_centres: Array) -> Alignment:
+    """Scale an alignment about the middle of its cameras; residuals are those to SLAM's positions after scaling."""
     old = alignment.map_from_sfm
     middle = old.points(sfm_centres).mean(axis=0)
-    moved = middle + found.ratio * (old.translation - middle)
-    similarity = Similarity(old.scale * found.ratio, old.rotation, moved)
+    moved = middle + ratio * (old.translation - middle)
+    similarity = Similarity(old.scale * ratio, old.rotation, moved)
     residual = np.linalg.norm(similarity.points(sfm_centres) - slam_centres, axis=1)
     used = residual[residual <= alignment.threshold_m]
-    scaled = dataclasses.replace(
+    return dataclasses.replace(
         alignment,
         map_from_sfm=similarity,
-        source="depth",
         n_used=len(used),
         rms_m=float(np.sqrt(np.mean((used if len(used) else residual) ** 2))),
         p95_m=float(np.percentile(residual, 95)),
     )
-    return scaled, []
 
 
 def _landmarks_of_images(model: Model) -> list[NDArray[np.int32]]:
@@ -106,6 +129,7 @@ def _landmarks_of_images(model: Model) -> list[NDArray[np.int32]]:
 
 
 def _ratios(xyz: Array, map_from_depth: Pose, camera: Camera, depth_mm: NDArray[np.uint16]) -> Array:
+    """Return (2, n): measured over mapped depth of landmarks, and the measured depth in m."""
     x_in_depth = map_from_depth.inv().apply(xyz)
     pixels, inside = camera.project(x_in_depth)
     inside &= (pixels >= 1).all(axis=1) & (pixels < (camera.width - 1, camera.height - 1)).all(axis=1)
@@ -115,4 +139,4 @@ def _ratios(xyz: Array, map_from_depth: Pose, camera: Camera, depth_mm: NDArray[
     measured = around[4]
     good = (around.min(axis=0) > _RANGE_M[0]) & (around.max(axis=0) < _RANGE_M[1])
     good &= np.ptp(around, axis=0) < _FLAT * measured
-    return np.asarray(measured[good] / x_in_depth[inside, 2][good])
+    return np.stack([measured[good] / x_in_depth[inside, 2][good], measured[good]])

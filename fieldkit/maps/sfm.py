@@ -21,6 +21,10 @@ from fieldkit.maps.source import SourceImage
 
 # Below this number of verified matches a pair is not used (COLMAP's own bound).
 _MIN_MATCHES = 15
+# Pairs that are verified between two tellings of progress
+_SHARE = 1000
+
+Progress = Callable[[str, int, int], None]
 
 
 @contextlib.contextmanager
@@ -70,6 +74,40 @@ def verify_geometry(path: Path, *, seed: int, n_threads: int = -1, with_pose: bo
         return int(database.num_verified_image_pairs())
 
 
+def write_verified(
+    path: Path,
+    images: Sequence[SourceImage],
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+    matches: Sequence[NDArray[np.uint32]],
+    *,
+    seed: int,
+    n_threads: int = -1,
+    progress: Progress = lambda step, done, total: None,
+) -> int:
+    """Write a COLMAP database with matches and their verified geometry; return the number of pairs that hold.
+
+    Pairs are verified in shares, each in a database of its own: COLMAP tells nothing while it works on one.
+    """
+    write_database(path, images, features, pairs, matches)
+    found: list[tuple[int, int, pycolmap.TwoViewGeometry]] = []
+    progress("verify", 0, len(pairs))
+    with tempfile.TemporaryDirectory(prefix="fieldkit-sfm-") as folder, quiet_colmap():
+        for first in range(0, len(pairs), _SHARE):
+            rows = slice(first, first + _SHARE)
+            share = Path(folder) / f"{first}.db"
+            write_database(share, images, features, pairs[rows], matches[rows])
+            verify_geometry(share, seed=seed, n_threads=n_threads)
+            found += _geometries(share)
+            share.unlink()
+            progress("verify", min(first + _SHARE, len(pairs)), len(pairs))
+        with contextlib.closing(pycolmap.Database.open(path)) as database:
+            with pycolmap.DatabaseTransaction(database):
+                for a, b, geometry in found:
+                    database.write_two_view_geometry(a, b, geometry)
+            return int(database.num_verified_image_pairs())
+
+
 def relative_poses(
     images: Sequence[SourceImage],
     features: Sequence[Features],
@@ -78,48 +116,49 @@ def relative_poses(
     *,
     seed: int,
     n_threads: int = -1,
+    progress: Progress = lambda step, done, total: None,
 ) -> list[Pose | None]:
     """Return b_from_a of every pair (a, b) by its matches alone, up to scale; None where they give none."""
     found: dict[Pair, Pose] = {}
     with tempfile.TemporaryDirectory(prefix="fieldkit-sfm-") as folder, quiet_colmap():
-        path = Path(folder) / "database.db"
-        write_database(path, images, features, pairs, matches)
-        verify_geometry(path, seed=seed, n_threads=n_threads, with_pose=True)
-        with contextlib.closing(pycolmap.Database.open(path)) as database:
-            for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
-                a, b = pycolmap.pair_id_to_image_pair(pair_id)
+        for first in range(0, len(pairs), _SHARE):
+            rows = slice(first, first + _SHARE)
+            share = Path(folder) / f"{first}.db"
+            write_database(share, images, features, pairs[rows], matches[rows])
+            verify_geometry(share, seed=seed, n_threads=n_threads, with_pose=True)
+            for a, b, geometry in _geometries(share):
                 if (b_from_a := geometry.cam2_from_cam1) is not None:
                     pose = Pose.from_matrix(np.vstack([b_from_a.matrix(), [0.0, 0.0, 0.0, 1.0]]))
                     found[a - 1, b - 1], found[b - 1, a - 1] = pose, pose.inv()
+            share.unlink()
+            progress("compare pairs", min(first + _SHARE, len(pairs)), len(pairs))
     return [found.get(pair) for pair in pairs]
 
 
-def reconstruct(
-    images: Sequence[SourceImage],
-    features: Sequence[Features],
-    pairs: Sequence[Pair],
-    matches: Sequence[NDArray[np.uint32]],
-    *,
-    seed: int,
-    progress: Callable[[str, int, int], None],
-    n_threads: int = -1,
-) -> pycolmap.Reconstruction:
-    """Reconstruct cameras and points; return the model with the most images, in SfM's own scale and frame.
+def _geometries(path: Path) -> list[tuple[int, int, pycolmap.TwoViewGeometry]]:
+    """Return the verified pairs of a database by their images' ids."""
+    with contextlib.closing(pycolmap.Database.open(path)) as database:
+        found = zip(*database.read_two_view_geometries(), strict=True)
+        return [(*pycolmap.pair_id_to_image_pair(pair_id), geometry) for pair_id, geometry in found]
 
-    Intrinsics and the geometry of a rig stay fixed: a rig's images are placed together, and in metres. Raises MapError
-    when no pair of images can be verified or no model grows.
+
+def reconstruct(
+    database: Path, images: Sequence[SourceImage], *, seed: int, progress: Progress
+) -> list[pycolmap.Reconstruction]:
+    """Reconstruct cameras and points from a verified database: models in SfM's own scale and frame, largest first.
+
+    Intrinsics and the geometry of a rig stay fixed: a rig's images are placed together, and in metres. More than one
+    model grows where the images show places that nothing connects. Raises MapError when no pair of images is verified
+    or no model grows.
     """
+    with contextlib.closing(pycolmap.Database.open(database)) as content:
+        n_pairs, n_verified = content.num_matched_image_pairs(), content.num_verified_image_pairs()
+    if not n_verified:
+        raise MapError(
+            f"no pair of the {len(images)} images shows the same place ({n_pairs} pairs with matches)",
+            hint="take overlapping, textured, sharp images and check the camera's parameters",
+        )
     with tempfile.TemporaryDirectory(prefix="fieldkit-sfm-") as folder, quiet_colmap():
-        database = Path(folder) / "database.db"
-        write_database(database, images, features, pairs, matches)
-        progress("verify", 0, len(pairs))
-        n_verified = verify_geometry(database, seed=seed, n_threads=n_threads)
-        progress("verify", len(pairs), len(pairs))
-        if not n_verified:
-            raise MapError(
-                f"no pair of the {len(images)} images shows the same place ({len(pairs)} pairs tried)",
-                hint="take overlapping, textured, sharp images and check the camera's parameters",
-            )
         done = 0
 
         def count() -> None:
@@ -127,18 +166,20 @@ def reconstruct(
             done += 1
             progress("reconstruct", min(done + 2, len(images)), len(images))
 
+        progress("reconstruct", 0, len(images))
         models = pycolmap.incremental_mapping(
-            database, folder, Path(folder) / "models", options=_mapping_options(seed), next_image_callback=count
+            database, folder, Path(folder) / "models", options=mapping_options(seed), next_image_callback=count
         )
     if not models:
         raise MapError(
             f"no reconstruction grew from {n_verified} verified pairs of {len(images)} images",
             hint="move sideways while mapping (turning on the spot gives no depth) and check the camera's parameters",
         )
-    return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
+    return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
-def _mapping_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+def mapping_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """Return the settings of incremental mapping and of triangulation."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = 1

@@ -233,6 +233,8 @@ def convert(values: Any, struct: type[T], *, path: Path, what: str) -> T:
     version = values.get("version", 1) if isinstance(values, dict) else 1
     if isinstance(version, int) and version > 1:
         raise StoreError(f"{path}: version {version}; this fieldkit reads version 1", hint="update fieldkit")
+    if isinstance(version, int) and version < 1:
+        raise StoreError(f"{path}: version {version}; this fieldkit reads version 1", hint="make it again")
     try:
         return msgspec.convert(values, struct)
     except msgspec.ValidationError as error:

@@ -14,6 +14,8 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, StoreError
 from fieldkit.frames import Array, Pose, pose, position_quaternion
 from fieldkit.store.files import atomic_write, read_text, read_toml, write_toml
+from fieldkit.store.kalibr import SUFFIXES as KALIBR_SUFFIXES
+from fieldkit.store.kalibr import read_kalibr
 from fieldkit.types import ViewKind
 
 Size = Annotated[int, msgspec.Meta(gt=0)]
@@ -31,12 +33,32 @@ class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_camera(path: Path) -> Camera:
-    """Read camera.toml: COLMAP model name, size in pixels, params in COLMAP's order."""
+    """Read camera.toml: COLMAP model name, size in pixels, params in COLMAP's order; or Kalibr's file of one camera."""
+    if Path(path).suffix in KALIBR_SUFFIXES:
+        cameras = read_kalibr(path)
+        if len(cameras) > 1:
+            raise StoreError(
+                f"{path}: has {len(cameras)} cameras; expected one", hint="keep the entry of this camera, as cam0"
+            )
+        return cameras[0].camera
     data = read_toml(path, _CameraFile, what="camera.toml with version, model, width, height, params")
     try:
         return Camera(data.model, data.width, data.height, tuple(data.params))
     except FieldkitError as error:
         raise StoreError(f"{path}: {error.message}", hint=error.hint) from error
+
+
+def calibration_file(folder: Path, kind: Literal["camera", "rig"]) -> Path:
+    """Return where a folder has its camera or rig: a .toml, or Kalibr's file of that name or called camchain.yaml.
+
+    A camchain is of a rig where ``images/`` has a folder for its first camera. Without any the name of the .toml.
+    """
+    chain = folder / "camchain.yaml"
+    is_rig = (folder / "images" / "cam0").is_dir()
+    names = [folder / f"{kind}{ending}" for ending in (".toml", *KALIBR_SUFFIXES)]
+    if is_rig == (kind == "rig"):
+        names.append(chain)
+    return next((name for name in names if name.is_file()), names[0])
 
 
 def write_camera(path: Path, camera: Camera, *, rms_px: float | None = None) -> None:
@@ -137,7 +159,9 @@ class _RigFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_rig(path: Path) -> Rig:
-    """Read rig.toml: [[camera]] and [depth_camera] with calibration and rig_from_cam."""
+    """Read rig.toml: [[camera]] and [depth_camera] with calibration and rig_from_cam; or Kalibr's camchain.yaml."""
+    if Path(path).suffix in KALIBR_SUFFIXES:
+        return Rig(tuple(RigCamera(c.name, c.camera, c.rig_from_cam) for c in read_kalibr(path)))
     data = read_toml(path, _RigFile, what="rig.toml with [[camera]] entries")
     if not data.camera:
         raise StoreError(f"{path}: no [[camera]]; expected at least one", hint="add the rig's cameras")

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import importlib.metadata
 
-LIBRARIES = ("fieldkit", "numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "pupil-apriltags", "rosbags")
+LIBRARIES = (
+    "fieldkit",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "pycolmap",
+    "pupil-apriltags",
+    "rosbags",
+    "torch",
+    "kornia",
+)
 
 
 def library_versions() -> dict[str, str]:

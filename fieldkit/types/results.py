@@ -76,7 +76,8 @@ class Truth:
 class Estimate:
     """A localized image: map_from_cam or None, covariance, counts, and seconds per stage.
 
-    ``status`` is "ok" or the reason of the failure: no_features, no_matches, few_inliers, no_pose.
+    ``status`` is "ok" or the reason of the failure: no_features, no_matches, few_inliers, no_pose, low_confidence; of
+    an image file also unreadable, other_size. ``confidence`` 0..1 is the probability that the pose is right.
     """
 
     map_from_cam: Pose | None
