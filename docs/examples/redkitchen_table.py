@@ -31,14 +31,16 @@ from fieldkit import store
 from fieldkit.errors import FieldkitError, WeightsError
 from fieldkit.features import read_image
 from fieldkit.frames import Pose, pose_error
-from fieldkit.localize import Localizer
-from fieldkit.maps import build_map, load_map
+from fieldkit.localize import Localizer, Query
+from fieldkit.maps import MapOptions, build_map, load_map
+from fieldkit.protocol import LocalizerRules
 from fieldkit.types import Estimate, SceneMap
 
 Array = NDArray[np.float64]
 Poses = Mapping[int, Pose]
 
-FEATURES = ("sift", "sift_l2", "akaze", "aliked", "xfeat", "superpoint")
+# A feature, and after a plus sign the matcher, of the map and of the queries.
+FEATURES = ("sift", "sift_l2", "akaze", "aliked", "aliked+lightglue", "xfeat", "superpoint")
 # (m, rad) within which a query counts as localized.
 LIMITS = ((0.05, np.radians(5.0)), (0.10, np.radians(1.0)))
 STAGES = ("extract", "retrieve", "match", "pnp")
@@ -57,6 +59,15 @@ class Row:
     queries_per_s: float
     given: Mapping[str, float]
     one_sfm: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which frames make the map, whether SfM places them or their given poses are kept, and where weights are."""
+
+    split: Literal["blocks", "interleaved"]
+    poses: Literal["slam", "known"]
+    weights: Path | None
 
 
 def divide(numbers: Sequence[int], split: str) -> tuple[list[int], list[int]]:
@@ -142,39 +153,51 @@ def cached_sfm(data: Path, out: Path, given: Poses) -> dict[int, Pose]:
     return align({int(name): pose for name, pose in store.read_tum(file)}, given)
 
 
-def localize_all(scene_map: SceneMap, data: Path, queries: Sequence[int]) -> tuple[list[Estimate], float]:
-    """Localize the queries one by one, after one to warm up; return the estimates and queries per second."""
-    localizer = Localizer(scene_map)
-    images = [read_image(data / "frames" / f"frame-{n:06d}.color.jpg", colour=True) for n in queries]
-    localizer.localize(images[0], COLOUR)
+def localize_all(localizer: Localizer, data: Path, queries: Sequence[int]) -> tuple[list[Estimate], float]:
+    """Localize the queries one by one, then again in two threads; return the estimates and queries per second."""
+    asked = [
+        Query(read_image(data / "frames" / f"frame-{n:06d}.color.jpg", colour=localizer.colour), COLOUR)
+        for n in queries
+    ]
+    localizer.localize(asked[0].image, COLOUR)
+    estimates = [localizer.localize(query.image, query.camera) for query in asked]
     start = time.perf_counter()
-    estimates = [localizer.localize(image, COLOUR) for image in images]
-    return estimates, len(images) / (time.perf_counter() - start)
+    again = list(localizer.localize_many(asked, threads=2))
+    return estimates, len(again) / (time.perf_counter() - start)
 
 
-def evaluate(feature: str, data: Path, out: Path, *, split: str, truths: tuple[Poses, Poses]) -> Row:
+def judge_both(
+    scene_map: SceneMap, found: Mapping[int, Pose | None], truths: tuple[Poses, Poses]
+) -> list[dict[str, float]]:
+    """Judge the queries against both truths; they are moved along with the map's own images, which are aligned."""
+    mapped = {int(Path(n).stem): p for n, p in zip(scene_map.image_names, scene_map.map_from_image, strict=True)}
+    posed = {n: p for n, p in found.items() if p is not None}
+    judged = []
+    for truth in truths:
+        moved = align({**mapped, **posed}, {n: p for n, p in truth.items() if n in mapped})
+        judged.append(judge({n: moved.get(n) for n in found}, truth))
+    return judged
+
+
+def evaluate(feature: str, data: Path, out: Path, *, options: Options, truths: tuple[Poses, Poses]) -> Row:
     """Build the feature's map, unless it is there, localize all queries and judge them against both truths."""
     given, _ = truths
-    mapping, queries = divide(sorted(given), split)
-    source, folder = out / split / "source", out / split / f"{feature}.map"
+    mapping, queries = divide(sorted(given), options.split)
+    source, folder = out / options.split / "source", out / options.split / options.poses / f"{feature}.map"
+    name, _, chosen = feature.partition("+")
+    matcher: Literal["nearest", "lightglue"] = "lightglue" if chosen else "nearest"
     if not source.is_dir():
         write_source(data, source, {n: given[n] for n in mapping})
     if not folder.is_dir():
-        build_map(source, folder, feature=feature)
+        made = MapOptions(matcher=matcher, poses=options.poses, weights=options.weights)
+        build_map(source, folder, feature=name, options=made)
     scene_map = load_map(folder)
-    estimates, rate = localize_all(scene_map, data, queries)
-    mapped = {int(Path(n).stem): p for n, p in zip(scene_map.image_names, scene_map.map_from_image, strict=True)}
+    localizer = Localizer(scene_map, LocalizerRules(matcher=matcher), weights=options.weights)
+    estimates, rate = localize_all(localizer, data, queries)
     found = {n: e.map_from_cam for n, e in zip(queries, estimates, strict=True)}
-    judged = []
-    for truth in truths:
-        # Queries are moved along with the map's images, but only these are aligned.
-        posed = {n: p for n, p in found.items() if p is not None}
-        known = {n: p for n, p in truth.items() if n in mapped}
-        moved = align({**mapped, **posed}, known)
-        judged.append(judge({n: moved.get(n) for n in queries}, truth))
     seconds = {s: float(np.median([e.seconds.get(s, 0.0) for e in estimates])) for s in STAGES}
     seconds["total"] = float(np.median([sum(e.seconds.values()) for e in estimates]))
-    return Row(feature, len(scene_map.xyz), seconds, rate, *judged)
+    return Row(feature, len(scene_map.xyz), seconds, rate, *judge_both(scene_map, found, truths))
 
 
 def line(row: Row) -> str:
@@ -199,6 +222,8 @@ def main(
     out: Path,
     features: tuple[str, ...] = FEATURES,
     split: Literal["blocks", "interleaved"] = "blocks",
+    poses: Literal["slam", "known"] = "slam",
+    weights: Path | None = None,
 ) -> None:
     """Print one row per feature; maps and the SfM over all frames are kept in ``out`` and used again.
 
@@ -207,20 +232,23 @@ def main(
         out: folder for maps and poses
         features: features to compare
         split: which frames make the map
+        poses: slam: SfM from the images, aligned to the given poses; known: landmarks triangulated from these
+        weights: folder where the weights of networks are looked for first
     """
     out.mkdir(parents=True, exist_ok=True)
     given = read_poses(data)
     truths = given, cached_sfm(data, out, given)
+    options = Options(split, poses, weights)
     print(HEADER, flush=True)
     rows = []
     for feature in features:
         try:
-            rows.append(evaluate(feature, data, out, split=split, truths=truths))
+            rows.append(evaluate(feature, data, out, options=options, truths=truths))
             print(line(rows[-1]), flush=True)
         except WeightsError as error:
             print(f"| {feature} | {error.message} |" + " |" * 11, flush=True)
     text = json.dumps([dataclasses.asdict(row) for row in rows], indent=1)
-    store.atomic_write(out / split / "rows.json", text + "\n")
+    store.atomic_write(out / split / poses / "rows.json", text + "\n")
 
 
 if __name__ == "__main__":
