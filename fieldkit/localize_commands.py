@@ -38,7 +38,7 @@ def localize(
     prior_poses: Path | None = None,
     prior_sigma_m: float = 0.5,
     prior_sigma_deg: float = 10.0,
-    threads: int = 2,
+    threads: int | None = None,
     json: bool = False,
     force: bool = False,
 ) -> None:
@@ -57,7 +57,7 @@ def localize(
         prior_poses: TUM text with where the camera is believed to be, by the image's name
         prior_sigma_m: standard deviation of its position along each axis
         prior_sigma_deg: standard deviation of its rotation about each axis
-        threads: images that are localized at the same time
+        threads: images that are localized at the same time; as many as there are processors where not given
         json: print JSON with status, inliers, covariance and seconds per image
         force: replace an existing file
     """

@@ -19,7 +19,7 @@ from fieldkit import maps, policies, scores, store
 from fieldkit.bags import open_recording
 from fieldkit.errors import FrameError, PriorError, ReplayError, TagError, TruthError
 from fieldkit.frames import pose_error
-from fieldkit.localize import Localizer
+from fieldkit.localize import Localizer, Query, default_threads, in_threads
 from fieldkit.odometry import offset_fault, summarize_faults
 from fieldkit.prior import estimate_prior, odometry_clock
 from fieldkit.protocol import Protocol
@@ -301,23 +301,38 @@ def _score_visit(
     results: dict[str, ViewResult] = {}
     thumbnails: dict[str, bytes] = {}
     settings = repr((*made_of, protocol.feature, protocol.localizer, protocol.seed, store.library_versions()))
-    for view in views.values():
-        image = view.frame.read()
-        estimate = _localize_once(image, view, localizer, cache=cache, settings=settings)
+    keyed = (_keyed(view, settings, cache) for view in views.values())
+    for seen in in_threads(lambda s: _localized(s, localizer), keyed, threads=default_threads()):
+        view, estimate = seen.view, cache.get(seen.key)
+        if estimate is None:
+            assert seen.estimate is not None
+            estimate = cache.put(seen.key, seen.estimate)
         results[view.id] = ViewResult(plan.session, plan.prior.visit, view.id, view.kind, view.frame.stamp_ns, estimate)
-        thumbnails[f"{plan.session}/{plan.prior.visit}/{view.id}"] = _thumbnail(image)
+        thumbnails[f"{plan.session}/{plan.prior.visit}/{view.id}"] = _thumbnail(seen.image)
     trials = scores.make_trials(plan, results, truths, protocol=protocol)
     return _Session(trials, tuple(results.values()), tuple(truths.values()), (plan,), thumbnails)
 
 
-def _localize_once(
-    image: Image, view: View, localizer: Localizer, *, cache: store.EstimateCache, settings: str
-) -> Estimate:
+@dataclasses.dataclass(frozen=True)
+class _Seen:
+    """A view's image, the key of its estimate, and the estimate once it is there."""
+
+    view: View
+    image: Image
+    key: str
+    estimate: Estimate | None
+
+
+def _keyed(view: View, settings: str, cache: store.EstimateCache) -> _Seen:
+    image = view.frame.read()
     key = store.digest(np.ascontiguousarray(image).tobytes(), repr(image.shape), repr(view.frame.camera), settings)
-    estimate = cache.get(key)
-    if estimate is None:
-        estimate = cache.put(key, localizer.localize(image, view.frame.camera))
-    return estimate
+    return _Seen(view, image, key, cache.get(key))
+
+
+def _localized(seen: _Seen, localizer: Localizer) -> _Seen:
+    if seen.estimate is not None:
+        return seen
+    return dataclasses.replace(seen, estimate=localizer.localize_query(Query(seen.image, seen.view.frame.camera)))
 
 
 def _thumbnail(image: Image) -> bytes:

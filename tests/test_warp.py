@@ -15,7 +15,7 @@ from fieldkit.calibrate.geometry import Poses
 from fieldkit.frames import Array
 from fieldkit.maps import MapWarp, map_warp
 from fieldkit.types import SceneMap
-from fieldkit.warp import MIN_OBSERVATIONS
+from fieldkit.warp import MIN_OBSERVATIONS, shared_errors
 
 
 @pytest.fixture(scope="module")
@@ -139,3 +139,15 @@ def test_landmarks_of_photos_are_rows_of_the_map() -> None:
     found = Landmarks.of([(photo.landmark, photo.bearings)], scene.xyz, scene.covariance)
     np.testing.assert_array_equal(scene.xyz[found.rows], found.xyz)
     assert len(Poses.of(scene.map_from_cams)) == 2
+
+
+def test_with_little_memory_the_shared_errors_are_the_same_and_of_fewer_images_larger(
+    room: SceneMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fieldkit.warp.LANDMARKS_AT_ONCE", 17)
+    landmark = np.arange(5, 40, 3)
+    response = np.random.default_rng(1).normal(size=(6, 3 * len(landmark)))
+    whole = map_warp(room).covariance(landmark, response)
+    np.testing.assert_allclose(shared_errors(room).covariance(landmark, response), whole, rtol=1e-7, atol=1e-12)
+    fewer = shared_errors(room, max_images=15).covariance(landmark, response)
+    assert np.trace(fewer) > 1.2 * np.trace(whole)

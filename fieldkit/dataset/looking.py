@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fieldkit.dataset.source import SourceView, SourceWaypoint, ViewSource
 from fieldkit.errors import SurfaceError
 from fieldkit.frames import Pose, pose_error
-from fieldkit.localize import Localizer
+from fieldkit.localize import Localizer, Query
 from fieldkit.maps import Gauge
 from fieldkit.scores import inside
 from fieldkit.store.datasets import DatasetRules, Shard, pose_row
@@ -96,7 +96,7 @@ class Studio:
         )
 
     def _localize(self, waypoint: SourceWaypoint, view: SourceView, *, repeat: int) -> Estimate:
-        return self._localizer.localize(self._source.shoot(waypoint, view, repeat=repeat), waypoint.camera)
+        return self._localizer.localize_query(Query(self._source.shoot(waypoint, view, repeat=repeat), waypoint.camera))
 
     def _seen(self, candidates: Candidates) -> _Seen:
         rules = self._rules.candidates

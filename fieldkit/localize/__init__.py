@@ -2,5 +2,6 @@
 
 from fieldkit.localize.localizer import Inliers, Localizer, Query, RigEstimate
 from fieldkit.localize.narrowing import CameraPrior
+from fieldkit.localize.parallel import default_threads, in_threads
 
-__all__ = ["CameraPrior", "Inliers", "Localizer", "Query", "RigEstimate"]
+__all__ = ["CameraPrior", "Inliers", "Localizer", "Query", "RigEstimate", "default_threads", "in_threads"]

@@ -11,7 +11,7 @@ from fieldkit.errors import FeatureError, LocalizeError
 from fieldkit.features import read_image
 from fieldkit.localize.localizer import Localizer, Query, RigEstimate
 from fieldkit.localize.narrowing import CameraPrior
-from fieldkit.localize.parallel import in_threads
+from fieldkit.localize.parallel import default_threads, in_threads
 from fieldkit.store.inputs import Rig
 from fieldkit.types import Estimate, Image
 
@@ -26,7 +26,7 @@ def localize_files(
     camera: Camera,
     *,
     priors: Mapping[str, CameraPrior] | None = None,
-    threads: int = 2,
+    threads: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[str, Estimate]]:
     """Localize one image file, or all image files of a folder in the order of their names; return name and estimate.
@@ -60,7 +60,7 @@ def localize_files(
             return _without("other_size")
         return localizer.localize_query(Query(image, camera, priors.get(file.name)))
 
-    found = list(_counted(in_threads(one, files, threads=threads), len(files), progress))
+    found = list(_counted(in_threads(one, files, threads=threads or default_threads()), len(files), progress))
     if sizes and (camera.height, camera.width) not in sizes:
         height, width = sorted(sizes)[0][:2]
         raise LocalizeError(
@@ -76,7 +76,7 @@ def localize_rig_files(
     folder: Path,
     rig: Rig,
     *,
-    threads: int = 2,
+    threads: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[str, RigEstimate]]:
     """Localize the frames of a rig, images ``<camera>/<frame>.*`` of a folder or of ``images`` in it.
@@ -114,7 +114,9 @@ def localize_rig_files(
         return localizer.localize_rig(images, rig.cameras)
 
     order = sorted(frames)
-    found = _counted(in_threads(one, [frames[f] for f in order], threads=threads), len(order), progress)
+    found = _counted(
+        in_threads(one, [frames[f] for f in order], threads=threads or default_threads()), len(order), progress
+    )
     return list(zip(order, found, strict=True))
 
 

@@ -17,7 +17,7 @@ from fieldkit.frames import Pose, compose_covariance
 from fieldkit.localize.chance import Agreement, confidence
 from fieldkit.localize.matching import expected_noise, landmark_noise, open_matcher
 from fieldkit.localize.narrowing import CameraPrior, plausible_images
-from fieldkit.localize.parallel import in_threads
+from fieldkit.localize.parallel import default_threads, in_threads
 from fieldkit.localize.pose import PosedPoints, Solved, estimate_pose, residuals_px
 from fieldkit.localize.retrieval import build_index, most_similar
 from fieldkit.protocol import LocalizerRules
@@ -153,14 +153,14 @@ class Localizer:
         self, image: Image, camera: Camera, *, prior: CameraPrior | None = None
     ) -> tuple[Estimate, Inliers | None]:
         """Localize as `localize` does; also return the matches that the pose rests on, None without a pose."""
-        return self._localize(Query(image, camera, prior), threads=2)
+        return self._localize(Query(image, camera, prior), threads=default_threads())
 
-    def localize_many(self, queries: Iterable[Query], *, threads: int = 2) -> Iterator[Estimate]:
+    def localize_many(self, queries: Iterable[Query], *, threads: int | None = None) -> Iterator[Estimate]:
         """Localize images in several threads, in their order and with the same bits as one by one.
 
         Images are taken from ``queries`` as they are needed. Raises as `localize` does.
         """
-        return in_threads(self.localize_query, queries, threads=threads)
+        return in_threads(self.localize_query, queries, threads=threads or default_threads())
 
     def localize_query(self, query: Query) -> Estimate:
         """Localize as `localize` does, in the calling thread alone: for callers that have several."""
@@ -189,7 +189,7 @@ class Localizer:
         for member in seen:
             prior = None if map_from_rig is None else _prior_of(map_from_rig, member.rig_from_cam)
             query = Query(images[member.name], member.camera, prior)
-            matched.append(self._matches(query, member.rig_from_cam, watch, threads=2))
+            matched.append(self._matches(query, member.rig_from_cam, watch, threads=default_threads()))
         found = self._pose(matched)
         watch.stop("pnp")
         return RigEstimate(

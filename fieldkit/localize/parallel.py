@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import concurrent.futures
+import os
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
+
+
+def default_threads() -> int:
+    """Return how many images are localized at once where nobody says: as many as there are processors, at most 8."""
+    return min(len(os.sched_getaffinity(0)), 8)
 
 
 def in_threads(work: Callable[[Given], Made], items: Iterable[Given], *, threads: int) -> Iterator[Made]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fieldkit.frames import Pose, adjoint, log
-from fieldkit.localize.kernels import MIN_DEPTH_M, linearise, weighted_sums
+from fieldkit.localize.kernels import MIN_DEPTH_M, cauchy_cost, linearise, refine
 
 Array = NDArray[np.float64]
 
@@ -24,6 +25,9 @@ _FIRST_NOISE = 2.5
 _UNDECIDED = 5.0
 # Residuals of this many standard deviations have half of the weight: 95 % as good as least squares on Gaussian ones
 _SCALE = 3.0
+_ITERATIONS = 20
+# Share of the variance that matches in one cell have in common: they lie on the same edges, lit and blurred alike
+_SHARED, _CELL_PX = 0.5, 16.0
 # Median of chi-square with 2 degrees of freedom
 _MEDIAN_CHI2 = 2.0 * math.log(2.0)
 # Shares of the inlier bound at which RANSAC is started. Distant, nearly planar landmarks have two poses that agree
@@ -63,21 +67,56 @@ class Solved:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Linear:
-    """Whitened rows f64[n, 2, 7] of all cameras' matches (derivatives by map_from_rig, residual), and f64[n, 2, 3]
-    by the landmarks."""
+class _Stacked:
+    """The matches of all cameras as `kernels` take them."""
 
-    rows: Array
-    by_landmark: Array
+    pixels: Array
+    sigma_px: Array
+    xyz: Array
+    covariance: Array
+    focal_px: Array
+    camera: NDArray[np.int64]
+    rig_rotation: Array
+    rig_position: Array
 
-    @property
-    def squared(self) -> Array:
-        return np.asarray((self.rows[:, :, 6] ** 2).sum(axis=1))
+    @staticmethod
+    def of(cameras: Sequence[PosedPoints]) -> _Stacked:
+        """Stack cameras."""
+        counts = [len(c.xyz) for c in cameras]
+        focal_px = np.array([c.focal_px for c in cameras], dtype=np.float64).reshape(-1, 2)
+        camera = np.repeat(np.arange(len(cameras)), counts)
+        return _Stacked(
+            np.concatenate([c.pixels for c in cameras]),
+            np.concatenate([c.sigma_px for c in cameras]),
+            np.concatenate([c.xyz for c in cameras]),
+            np.concatenate([c.xyz_covariance for c in cameras]),
+            focal_px[camera],
+            camera,
+            np.stack([_from_rig(c).rotation.as_matrix() for c in cameras]),
+            np.stack([np.asarray(_from_rig(c).translation) for c in cameras]),
+        )
 
-    def sums(self, squared_scale: float) -> tuple[Array, Array, float]:
-        """Return weighted information (6, 6), gradient (6,) and Cauchy cost."""
-        information, gradient = np.zeros((6, 6)), np.zeros(6)
-        return information, gradient, float(weighted_sums(self.rows, squared_scale, information, gradient))
+    def arguments(self, noise: float) -> tuple[NDArray[Any], ...]:
+        """Return what every kernel takes first; ``noise`` multiplies the expected one."""
+        variance = (noise * self.sigma_px) ** 2
+        return (
+            self.pixels, variance, self.xyz, self.covariance, self.focal_px, self.camera, self.rig_rotation,
+            self.rig_position,
+        )  # fmt: skip
+
+    def linear(self, map_from_rig: Pose, noise: float) -> tuple[Array, Array]:
+        """Return whitened rows f64[n, 2, 7] (derivatives by the pose, residual), and f64[n, 2, 3] by landmarks."""
+        rows, by_landmark = np.empty((len(self.xyz), 2, 7)), np.empty((len(self.xyz), 2, 3))
+        rotation, position = map_from_rig.rotation.as_matrix(), np.array(map_from_rig.translation)
+        linearise(*self.arguments(noise), rotation, position, rows, by_landmark)
+        return rows, by_landmark
+
+    def refined(self, map_from_rig: Pose, noise: float, scale: float) -> Pose:
+        """Return the pose of least Cauchy cost near another."""
+        rotation, position = map_from_rig.rotation.as_matrix(), np.array(map_from_rig.translation)
+        rows, by_landmark = np.empty((len(self.xyz), 2, 7)), np.empty((len(self.xyz), 2, 3))
+        refine(*self.arguments(noise), rotation, position, scale**2, _ITERATIONS, rows, by_landmark)
+        return Pose.from_components(position, Rotation.from_matrix(rotation))
 
 
 def estimate_pose(cameras: Sequence[PosedPoints], *, max_error_px: float, seed: int) -> Solved | None:
@@ -111,7 +150,7 @@ def estimate_pose(cameras: Sequence[PosedPoints], *, max_error_px: float, seed: 
 
 
 def refine_pose(
-    cameras: Sequence[PosedPoints], map_from_rig: Pose, *, noise: float, scale: float = _SCALE, iterations: int = 20
+    cameras: Sequence[PosedPoints], map_from_rig: Pose, *, noise: float, scale: float = _SCALE
 ) -> tuple[Pose, Array, Array]:
     """Refine a pose on its inliers by reweighted Gauss-Newton; return it, its 6x6 covariance, and f64[6, 3n].
 
@@ -121,25 +160,29 @@ def refine_pose(
     pooled with the expected; it takes the landmarks' errors as independent. The last is how the pose follows the
     landmarks.
     """
-    for _ in range(iterations):
-        information, gradient, _ = _linear(cameras, map_from_rig, noise).sums(scale**2)
-        step = np.linalg.lstsq(information, -gradient, rcond=None)[0]
-        rotation = map_from_rig.rotation
-        map_from_rig = Pose.from_components(
-            map_from_rig.translation + rotation.apply(step[3:]), rotation * Rotation.from_rotvec(step[:3])
-        )
-        if float(np.abs(step).max()) < 1e-9:
-            break
-    linear = _linear(cameras, map_from_rig, noise)
+    stacked = _Stacked.of(cameras)
+    refined = stacked.refined(map_from_rig, noise, scale)
+    rows, by_landmark = stacked.linear(refined, noise)
+    squared, by_pose = _squared(rows), rows[:, :, :6]
     # For weights 1 / (1 + r^2 / c^2) in two dimensions the mean derivative of the weighted residual is that of their
     # squares, too.
-    slope = (1.0 + linear.squared / scale**2) ** -2
-    seen = slope.sum()
-    variance = (0.5 * slope @ linear.squared + EXPECTED_MATCHES) / (max(seen - 3.0, 0.0) + EXPECTED_MATCHES)
-    weighted = slope[:, None, None] * linear.rows[:, :, :6]
-    inverse = np.linalg.pinv(np.einsum("nai,naj->ij", weighted, linear.rows[:, :, :6]), hermitian=True)
-    response = -np.einsum("ij,naj,nak->ink", inverse, weighted, linear.by_landmark)
-    return map_from_rig, 0.5 * variance * (inverse + inverse.T), response.reshape(6, -1)
+    slope = (1.0 + squared / scale**2) ** -2
+    variance = (0.5 * slope @ squared + EXPECTED_MATCHES) / (max(slope.sum() - 3.0, 0.0) + EXPECTED_MATCHES)
+    weighted = slope[:, None, None] * by_pose
+    alone = np.einsum("nai,naj->ij", weighted, by_pose)
+    inverse = np.linalg.pinv(alone, hermitian=True)
+    response = -np.einsum("ij,njk->ink", inverse, np.einsum("naj,nak->njk", weighted, by_landmark))
+    spread = inverse @ ((1.0 - _SHARED) * alone + _SHARED * _crowded(stacked, weighted)) @ inverse
+    return refined, 0.5 * variance * (spread + spread.T), response.reshape(6, -1)
+
+
+def _crowded(stacked: _Stacked, weighted: Array) -> Array:
+    """Return the information (6, 6) that matches would have whose errors are the same in every cell of the image."""
+    cells = np.column_stack([stacked.camera, np.floor(stacked.pixels / _CELL_PX).astype(np.int64)])
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    sums = np.zeros((int(cell.max(initial=-1)) + 1, 2, 6))
+    np.add.at(sums, cell.ravel(), weighted)
+    return np.asarray(np.einsum("cai,caj->ij", sums, sums))
 
 
 def shown_noise(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
@@ -147,9 +190,10 @@ def shown_noise(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
 
     The landmarks' own uncertainty is taken off.
     """
-    count, shown = sum(len(c.xyz) for c in cameras), 1.0
+    stacked, shown = _Stacked.of(cameras), 1.0
+    count = len(stacked.xyz)
     for _ in range(4):
-        squared = _linear(cameras, map_from_rig, math.sqrt(shown)).squared
+        squared = _squared(stacked.linear(map_from_rig, math.sqrt(shown))[0])
         shown = max(shown * float(np.median(squared)) / _MEDIAN_CHI2, 0.01)
     shown *= count / max(count - 3.0, 1.0)
     return math.sqrt((count * shown + EXPECTED_MATCHES) / (count + EXPECTED_MATCHES))
@@ -160,7 +204,7 @@ def _settled(
 ) -> Pose | None:
     """Return where a pose settles: starts that mean the same pose end at the same one."""
     for _ in range(2):
-        map_from_rig = refine_pose(_subsets(cameras, inliers), map_from_rig, noise=_FIRST_NOISE, scale=1.0)[0]
+        map_from_rig = _Stacked.of(_subsets(cameras, inliers)).refined(map_from_rig, _FIRST_NOISE, 1.0)
         inliers = _inliers(cameras, map_from_rig, max_error_px)
         if sum(int(i.sum()) for i in inliers) < 4:
             return None
@@ -169,7 +213,11 @@ def _settled(
 
 def _cost(cameras: Sequence[PosedPoints], map_from_rig: Pose) -> float:
     """Return the Cauchy cost of all matches, right and wrong, at a pose."""
-    return _linear(cameras, map_from_rig, _FIRST_NOISE).sums(1.0)[2]
+    return float(cauchy_cost(_Stacked.of(cameras).linear(map_from_rig, _FIRST_NOISE)[0], 1.0))
+
+
+def _squared(rows: Array) -> Array:
+    return np.asarray((rows[:, :, 6] ** 2).sum(axis=1))
 
 
 def _between(map_from_rig: Pose, others: Sequence[Pose], costs: Sequence[float]) -> Array:
@@ -181,24 +229,6 @@ def _between(map_from_rig: Pose, others: Sequence[Pose], costs: Sequence[float])
     weights = np.exp(-(np.asarray(costs) - min(costs)) / _UNDECIDED)
     offsets = np.stack([log(map_from_rig.inv() * other) for other in others])
     return np.asarray(np.einsum("n,ni,nj->ij", weights / weights.sum(), offsets, offsets))
-
-
-def _linear(cameras: Sequence[PosedPoints], map_from_rig: Pose, noise: float) -> _Linear:
-    rows, by_landmark = zip(*(_linear_camera(c, map_from_rig, noise) for c in cameras), strict=True)
-    return _Linear(np.concatenate(rows), np.concatenate(by_landmark))
-
-
-def _linear_camera(camera: PosedPoints, map_from_rig: Pose, noise: float) -> tuple[Array, Array]:
-    pose = map_from_rig if camera.rig_from_cam is None else map_from_rig * camera.rig_from_cam
-    rows, by_landmark = np.empty((len(camera.xyz), 2, 7)), np.empty((len(camera.xyz), 2, 3))
-    variance = (noise * camera.sigma_px) ** 2
-    given = (camera.pixels, camera.xyz, camera.xyz_covariance, np.asarray(camera.focal_px), variance)
-    points = [np.ascontiguousarray(a, dtype=np.float64) for a in given]
-    rotation, position = np.ascontiguousarray(pose.rotation.as_matrix()), np.array(pose.translation)
-    linearise(*points, rotation, position, rows, by_landmark)
-    if camera.rig_from_cam is not None:
-        rows[:, :, :6] = rows[:, :, :6] @ adjoint(camera.rig_from_cam.inv())
-    return rows, by_landmark
 
 
 def _carried(solved: Solved, cameras: Sequence[PosedPoints], cam_from_rig: Pose) -> Solved:

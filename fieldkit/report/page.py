@@ -193,6 +193,7 @@ def _provenance(run: Run) -> tuple[tuple[str, str], ...]:
         ("Thresholds", ", ".join(_words(t) for t in run.protocol.thresholds) + " (both errors strictly below)"),
         ("Truth", _truth_words(run)),
         ("Localizer", _localizer_words(run)),
+        ("Time per view", _time_words(run)),
         ("Protocol", f"{run.protocol.name}, version {run.protocol.version}"),
         ("Recordings", ", ".join(run.recordings) or "none"),
         ("Sessions", ", ".join(run.sessions) or "none"),
@@ -208,7 +209,18 @@ def _provenance(run: Run) -> tuple[tuple[str, str], ...]:
 def _localizer_words(run: Run) -> str:
     rules = run.protocol.localizer
     bounds = f"reprojection {rules.max_reprojection_px:g} px, at least {rules.min_inliers} inliers"
-    return f"{run.protocol.feature}, top {rules.top_k} retrieved, {bounds}"
+    return f"{run.protocol.feature}, top {rules.top_k} retrieved, {bounds}, confidence {rules.min_confidence:g}"
+
+
+def _time_words(run: Run) -> str:
+    """Return the median and the 95th percentile of the time that each stage took, in ms."""
+    words = []
+    for stage in ("extract", "retrieve", "match", "pnp"):
+        ms = [1e3 * r.estimate.seconds[stage] for r in run.results if stage in r.estimate.seconds]
+        if ms:
+            median, slow = np.percentile(ms, (50, 95))
+            words.append(f"{stage} {median:.0f} ({slow:.0f})")
+    return f"{', '.join(words)} ms: median (95th percentile)" if words else "not known"
 
 
 def _notes(run: Run) -> tuple[str, ...]:
