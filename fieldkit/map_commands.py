@@ -22,6 +22,7 @@ def map_build(
     out: Path,
     feature: str = "sift",
     matcher: Literal["nearest", "lightglue"] = "nearest",
+    retrieval: Literal["own", "efficientnet", "dinov2"] = "own",
     weights: Path | None = None,
     poses: Literal["slam", "known", "none"] = "slam",
     scale: Literal["auto", "slam", "tags", "depth"] = "auto",
@@ -37,8 +38,9 @@ def map_build(
     Args:
         source: mapping folder (rig.toml) or image folder (images/, camera.toml, poses.txt, depth/)
         out: map folder to write
-        feature: local feature of landmarks: sift, sift_l2, akaze, aliked, xfeat, superpoint
-        matcher: how pairs of mapping images are matched: nearest neighbours, or lightglue (aliked only, slow)
+        feature: local feature of landmarks: sift, sift_l2, akaze, aliked, aliked_n16, aliked_t16, xfeat, superpoint
+        matcher: how pairs of mapping images are matched: nearest neighbours, or lightglue (aliked, aliked_n16; slow)
+        retrieval: by what images to be localized find mapping images: descriptors of their landmarks, or a network's
         weights: folder where the weights of networks are looked for first
         poses: slam gives scale, frame and gravity; known takes the poses as they are; none does not read them
         scale: from what; auto takes tags where --size-m is given, else calibrated depth images, else SLAM
@@ -52,6 +54,7 @@ def map_build(
 
     options = maps.MapOptions(
         matcher=matcher,
+        retrieval=retrieval,
         weights=weights,
         poses=poses,
         scale=scale,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
@@ -38,12 +39,18 @@ class Observed(Protocol):
 def reprojection_errors(model: Observed) -> Array:
     """Return the distance (px) between every observation and its projected landmark; inf behind the camera."""
     errors = np.full(len(model.observation_image), np.inf)
+    for rows, distance in errors_by_image(model):
+        errors[rows] = distance
+    return errors
+
+
+def errors_by_image(model: Observed) -> Iterator[tuple[slice, Array]]:
+    """Yield what `reprojection_errors` returns, image by image, with the observations' rows."""
     for i, rows in observations_of(model.observation_image, len(model.image_names)):
         x_in_cam = model.map_from_image[i].inv().apply(model.xyz[model.observation_landmark[rows]])
         pixels, _ = model.image_cameras[i].project(x_in_cam)
         distance = np.linalg.norm(pixels - model.observation_px[rows], axis=1)
-        errors[rows] = np.where(np.isfinite(distance), distance, np.inf)
-    return errors
+        yield rows, np.where(np.isfinite(distance), distance, np.inf)
 
 
 def projection_jacobian(xyz: Array, map_from_cam: Pose, camera: Camera) -> Array:

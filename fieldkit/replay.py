@@ -104,6 +104,7 @@ def replay(
         for r in opened
     ]
     run = _collect(opened, sessions, scene_map=scene_map, tags=tags, applied=given.applied, protocol=protocol)
+    run = dataclasses.replace(run, map_seconds=maps.map_info(map_path).get("seconds", {}))
     unfiltered = policies.unfiltered(scene_map, protocol)
     if unfiltered is not None:
         log.warning("%s are excluded: %s", unfiltered.what, unfiltered.reason)

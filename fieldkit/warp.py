@@ -15,7 +15,7 @@ import scipy.sparse.linalg
 from numpy.typing import NDArray
 
 from fieldkit.frames import Pose, skew
-from fieldkit.observations import PRIOR_M, reprojection_errors
+from fieldkit.observations import PRIOR_M, errors_by_image
 from fieldkit.types import SceneMap
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ UNSHOWN_SIGMA_PX = 1.0
 MIN_DEPTH_M = 1e-3
 # More images take seconds to factorize, and a query 20 ms and more
 MAX_IMAGES = 2000
-LANDMARKS_AT_ONCE = 20_000
+LANDMARKS_AT_ONCE = 8_000
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,8 +123,10 @@ def shared_errors(scene_map: SceneMap, *, max_images: int = MAX_IMAGES) -> Share
     chosen = np.arange(0, len(scene_map.image_names), step)
     image_row = np.full(len(scene_map.image_names), -1, dtype=np.int32)
     image_row[chosen] = np.arange(len(chosen), dtype=np.int32)
-    rows = np.argsort(scene_map.observation_landmark, kind="stable").astype(np.int32)
-    rows = rows[image_row[scene_map.observation_image[rows]] >= 0]
+    # Observations are sorted by image; an index of them all would be as large as four of their arrays
+    counts = np.diff(np.searchsorted(scene_map.observation_image, np.arange(len(image_row) + 1)))
+    used = np.flatnonzero(np.repeat(image_row >= 0, counts)).astype(np.int32)
+    rows: NDArray[np.int32] = used[np.argsort(scene_map.observation_landmark[used], kind="stable")]
     landmark = scene_map.observation_landmark[rows]
     starts = np.searchsorted(landmark, np.arange(len(scene_map.xyz) + 1)).astype(np.int64)
     views = _Views.of(scene_map)
@@ -231,10 +233,12 @@ def _similarities(map_from_image: Sequence[Pose]) -> Array:
 
 
 def _sigma_px(scene_map: SceneMap) -> float:
-    errors = reprojection_errors(scene_map)
-    errors = errors[np.isfinite(errors)]
-    freedom = 2 * len(errors) - 3 * len(scene_map.xyz) - 6 * len(scene_map.image_names)
-    return float(np.sqrt((errors**2).sum() / freedom)) if freedom > 0 else UNSHOWN_SIGMA_PX
+    count, total = 0, 0.0
+    for _, errors in errors_by_image(scene_map):
+        finite = errors[np.isfinite(errors)]
+        count, total = count + len(finite), total + float((finite**2).sum())
+    freedom = 2 * count - 3 * len(scene_map.xyz) - 6 * len(scene_map.image_names)
+    return float(np.sqrt(total / freedom)) if freedom > 0 else UNSHOWN_SIGMA_PX
 
 
 def _blocks(

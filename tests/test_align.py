@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,7 @@ from synthetic_map import looking
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose, exp, pose_error
 from fieldkit.maps.align import align_to_slam, robust_similarity, umeyama
+from fieldkit.maps.motion import motion_scale
 
 ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7])
 
@@ -95,3 +98,52 @@ def test_alignment_needs_a_walk_and_poses() -> None:
         align_to_slam(still, still, seed=0)
     with pytest.raises(MapError, match="2 mapped images have a SLAM pose; expected at least 3"):
         align_to_slam(still[:2], still[:2], seed=0)
+
+
+def drifting(poses: list[Pose], rng: np.random.Generator, *, m: float = 0.003, yaw: float = 0.003) -> list[Pose]:
+    """Track poses as SLAM does: every step is a little wrong, and so is all that follows."""
+    found = [poses[0]]
+    for before, after in itertools.pairwise(poses):
+        turn = Rotation.from_rotvec([0.0, 0.0, rng.normal(0, yaw)])
+        step = before.inv() * after
+        noisy = Pose.from_components(step.translation + rng.normal(0, m, 3), step.rotation)
+        moved = found[-1] * noisy
+        found.append(Pose.from_components(moved.translation, turn * moved.rotation))
+    return found
+
+
+def test_the_steps_of_a_drifting_walk_tell_its_scale_better_than_its_positions() -> None:
+    off: dict[str, list[float]] = {"positions": [], "steps": [], "sigmas": []}
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        poses = walk(rng, 80)
+        slam = drifting(poses, rng)
+        by_positions = align_to_slam(as_sfm(poses), slam, seed=0)
+        by_steps = align_to_slam(as_sfm(poses), slam, seed=0, walks=[range(80)])
+        assert by_steps.scale_sigma is not None
+        off["positions"].append(by_positions.map_from_sfm.scale * 3.7 - 1)
+        off["steps"].append(by_steps.map_from_sfm.scale * 3.7 - 1)
+        off["sigmas"].append((by_steps.map_from_sfm.scale * 3.7 - 1) / by_steps.scale_sigma)
+    rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in off.items()}
+    assert rms["steps"] < 0.6 * rms["positions"]
+    assert 0.5 < rms["sigmas"] < 1.6
+
+
+def test_positions_tell_the_scale_where_steps_are_short_against_their_noise(rng: np.random.Generator) -> None:
+    poses = walk(rng, 80)
+    noisy = [Pose.from_translation(rng.normal(0, 0.08, 3)) * p for p in poses]
+    plain = align_to_slam(as_sfm(poses), noisy, seed=0)
+    assert align_to_slam(as_sfm(poses), noisy, seed=0, walks=[range(80)]).map_from_sfm.scale == pytest.approx(
+        plain.map_from_sfm.scale, rel=1e-9
+    )
+
+
+def test_steps_into_wrong_positions_do_not_count_and_short_walks_have_none(rng: np.random.Generator) -> None:
+    poses = walk(rng, 80)
+    slam = drifting(poses, rng, m=0.002, yaw=0.001)
+    jump = exp([0.0, 0.0, 0.4, 1.0, -2.0, 0.0])
+    moved = [jump * p if 30 <= i < 54 else p for i, p in enumerate(slam)]
+    clean, wrong = (align_to_slam(as_sfm(poses), s, seed=0, walks=[range(80)]) for s in (slam, moved))
+    assert abs(wrong.map_from_sfm.scale / clean.map_from_sfm.scale - 1) < 0.002
+    assert motion_scale(as_sfm(poses)[:6], slam[:6], [range(6)]) is None
+    assert motion_scale([poses[0]] * 20, [poses[0]] * 20, [range(20)]) is None

@@ -19,7 +19,7 @@ from fieldkit.maps.plausible import SlamRules, plausible_pairs
 from fieldkit.maps.sfm import relative_poses
 from fieldkit.maps.source import MapSource, SourceImage
 from fieldkit.maps.stages import Stages
-from fieldkit.maps.strays import contradicting, strays
+from fieldkit.maps.strays import contradicting, folded, strays
 
 PLACES = [looking(np.array([x, 0.0, 1.5]), np.pi / 2) for x in (0.0, 1.0)]
 ELSEWHERE = PLACES[1] * exp([0.0, 0.0, 0.0, 0.0, 0.0, 3.0])
@@ -90,8 +90,9 @@ def test_the_end_of_a_corridor_that_lies_on_its_beginning_is_told(rng: np.random
     assert strays(images, true, threshold_m=0.05) == []
     end = [i for i, p in true.items() if p.translation[0] > 6.0]
     back = Pose.from_translation([-5.0, 0.0, 0.0])
-    folded = true | {i: back * true[i] for i in end}
-    assert strays(images, folded, threshold_m=0.05) == end
+    moved = true | {i: back * true[i] for i in end}
+    assert strays(images, moved, threshold_m=0.05) == end
+    assert folded(images, moved, threshold_m=0.05) == set(end)
     last = list(range(46, 50))
     open_end = true | {i: Pose.from_translation([3.0, 0.0, 0.0]) * true[i] for i in last}
     assert strays(images, open_end, threshold_m=0.05) == last
@@ -102,10 +103,13 @@ def test_a_stretch_that_slam_has_elsewhere_stays_in_the_map(rng: np.random.Gener
     jump = Pose.from_translation([-4.0, 1.0, 0.0])
     lost = [replaced(image, jump) if 20 <= i < 33 else image for i, image in enumerate(images)]
     assert strays(lost, true, threshold_m=0.05) == []
+    assert len(contradicting(lost, true, threshold_m=0.05)) == 13
+    assert folded(lost, true, threshold_m=0.05) == set()
     wrong = rng.random(len(images)) < 0.3
     off = [Pose.from_translation(rng.normal(0, 2.0, 3)) for _ in images]
     scattered = [replaced(image, off[i]) if wrong[i] else image for i, image in enumerate(images)]
     assert strays(scattered, true, threshold_m=0.05) == []
+    assert folded(scattered, true, threshold_m=0.05) == set()
 
 
 def replaced(image: SourceImage, moved: Pose) -> SourceImage:
@@ -141,8 +145,8 @@ def two_rooms(rng: np.random.Generator) -> Matched:
 
 def test_a_map_in_which_one_room_lies_on_the_next_is_unfolded(tmp_path: Path, rng: np.random.Generator) -> None:
     found, options, stages = two_rooms(rng), MapOptions(n_threads=1), Stages(tmp_path, {})
-    folded = place_once(found, stages, options, seed=0, progress=quiet)
-    assert folded.contradicting > 0.05 * len(folded.sfm_poses)
+    first = place_once(found, stages, options, seed=0, progress=quiet)
+    assert first.contradicting > 0.05 * len(first.sfm_poses)
     less = unfolded(found, SlamRules(), stages, options, seed=0, progress=quiet)
     again = place_once(less, stages, options, seed=0, progress=quiet, name="unfolded")
     assert again.contradicting == 0

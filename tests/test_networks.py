@@ -132,6 +132,13 @@ def test_mutual_neighbours_find_the_pixels_of_a_warped_image_again(feature: str)
     assert (errors < 2.0).mean() > 0.6
 
 
+@pytest.mark.parametrize(("feature", "width"), [("aliked_n16", 128), ("aliked_t16", 64)])
+def test_variants_of_aliked_are_features_of_their_own(feature: str, width: int) -> None:
+    found = open_extractor(feature, max_keypoints=60).extract(photo())
+    assert found.descriptors.shape == (60, width)
+    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, atol=1e-5)
+
+
 def test_lightglue_matches_a_warped_image_and_needs_a_feature_that_it_knows() -> None:
     image = photo()
     warp = cv2.getRotationMatrix2D((160.0, 112.0), 8.0, 1.1)
@@ -148,7 +155,7 @@ def test_lightglue_matches_a_warped_image_and_needs_a_feature_that_it_knows() ->
     np.testing.assert_array_equal(again, pairs)
     none = opened("aliked").extract(np.zeros((64, 64), np.uint8))
     assert len(network.match(a, (320, 224), none, (64, 64))[0]) == 0
-    with pytest.raises(FeatureError, match="no LightGlue for feature 'sift'; expected one of: aliked"):
+    with pytest.raises(FeatureError, match="no LightGlue for feature 'sift'; expected one of: aliked, aliked_n16"):
         open_matcher("sift", "lightglue")
 
 

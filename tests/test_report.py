@@ -19,6 +19,7 @@ from synthetic_run import make_run
 from fieldkit import report, store
 from fieldkit.errors import ReportError, StoreError
 from fieldkit.report import render, thumbnail_key, write_report
+from fieldkit.report.page import _provenance
 from fieldkit.scores import summarize_run, table
 from fieldkit.types import Excluded, PlanView, Run
 
@@ -116,6 +117,15 @@ def test_page_states_every_recall_with_its_interval(run: Run, page: str) -> None
     for summary in summarize_run(run):
         for value, (low, high) in zip(summary.recall, summary.interval, strict=True):
             assert f"{100 * value:.1f} [{100 * low:.0f}, {100 * high:.0f}]" in text
+
+
+def test_page_states_the_seconds_of_map_and_views(run: Run) -> None:
+    estimated = dataclasses.replace(run.results[0].estimate, seconds={"extract": 0.05, "pnp": 0.0125})
+    results = (dataclasses.replace(run.results[0], estimate=estimated),)
+    timed = dataclasses.replace(run, map_seconds={"verify": 12.0}, results=results)
+    told = _provenance(timed)
+    assert ("Seconds", "map: verify 12; view (median): extract 0.05, pnp 0.0125") in told
+    assert ("Seconds", "not known") in _provenance(dataclasses.replace(run, results=()))
 
 
 def test_best_of_each_column_is_marked_and_is_never_the_oracle(run: Run, page: str) -> None:

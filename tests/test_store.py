@@ -90,6 +90,14 @@ def test_a_run_reads_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(plan.candidates.forward_in_map, [1.0, 0, 0])
 
 
+def test_the_seconds_of_building_the_map_are_kept_with_a_run(tmp_path: Path) -> None:
+    built = dataclasses.replace(make_run(), map_seconds={"extract": 20.5, "match": 34.25})
+    store.write_run(tmp_path / "run", built)
+    assert store.read_run(tmp_path / "run").map_seconds == {"extract": 20.5, "match": 34.25}
+    store.write_run(tmp_path / "old", make_run())
+    assert store.read_run(tmp_path / "old").map_seconds == {}
+
+
 def test_a_run_is_never_overwritten_without_force(tmp_path: Path) -> None:
     store.write_run(tmp_path / "run", make_run())
     with pytest.raises(StoreError, match="exists already; give --force"):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from fieldkit.calibrate.locating import locate
 from fieldkit.calibrate.photos import Progress, find_tags, list_photos, parse_sizes
 from fieldkit.calibrate.second import check_in_second_map, refuse_same_map
@@ -54,7 +56,8 @@ def calibrate_photos(
             hint="take photos that show the tag and much of its mapped surroundings",
         )
     warp = map_warp(scene_map)
-    solved = solve_tags(located, scene_map.xyz, scene_map.xyz_covariance, sizes_m=sizes_m, warp=warp)
+    covariance = np.asarray(scene_map.xyz_covariance, dtype=np.float64)
+    solved = solve_tags(located, scene_map.xyz, covariance, sizes_m=sizes_m, warp=warp)
     everything = photo_verdicts(solved, located) + rejected
     refused = [sum(_is_of(p, t.group) for p in rejected) for t in solved.tags]
     warn(solved.tags, everything, refused)

@@ -116,7 +116,9 @@ def check_in_second_map(
 
 def _placed(located: Sequence[LocatedPhoto], files: Sequence[str], scene_map: SceneMap) -> PlacedPhotos:
     chosen = [p for p in located if p.file in files]
-    fixed, _ = place_photos(chosen, scene_map.xyz, scene_map.xyz_covariance, map_warp(scene_map))
+    fixed, _ = place_photos(
+        chosen, scene_map.xyz, np.asarray(scene_map.xyz_covariance, dtype=np.float64), map_warp(scene_map)
+    )
     return PlacedPhotos(tuple(fixed.centre.pose(i) for i in range(len(chosen))), fixed.covariance)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import FeatureError, suggestion
+from fieldkit.features import aliked
 from fieldkit.features.akaze import detect_akaze
-from fieldkit.features.aliked import load_aliked
 from fieldkit.features.images import read_grey, read_image, to_colour, to_grey
 from fieldkit.features.sift import detect_sift, detect_sift_l2
 from fieldkit.features.superpoint import load_superpoint
@@ -82,13 +83,20 @@ class FeatureKind:
     lightglue: str | None = None
 
 
+def _aliked(variant: aliked.AlikedVariant, *, lightglue: str | None = None) -> FeatureKind:
+    load = functools.partial(aliked.load_aliked, variant)
+    return FeatureKind(load, variant.width, "mutual", colour=True, min_cosine=0.6, lightglue=lightglue)
+
+
 # Least similarities: ALIKED's by eight pairs of red kitchen frames (19 of 20 right matches pass, a third of the wrong
 # ones do not), XFeat's as published, SuperPoint's as hloc has it (a distance of 0.7).
 FEATURES: dict[str, FeatureKind] = {
     "sift": FeatureKind(lambda folder: detect_sift, 128, "ratio", dtype="uint8"),
     "sift_l2": FeatureKind(lambda folder: detect_sift_l2, 128, "ratio", dtype="uint8"),
     "akaze": FeatureKind(lambda folder: detect_akaze, 64, "ratio"),
-    "aliked": FeatureKind(load_aliked, 128, "mutual", colour=True, min_cosine=0.6, lightglue="lightglue-aliked"),
+    "aliked": _aliked(aliked.N16ROT, lightglue="lightglue-aliked"),
+    "aliked_n16": _aliked(aliked.N16, lightglue="lightglue-aliked"),
+    "aliked_t16": _aliked(aliked.T16),
     "xfeat": FeatureKind(load_xfeat, 64, "mutual", colour=True, min_cosine=0.82),
     "superpoint": FeatureKind(load_superpoint, 256, "mutual", min_cosine=0.755),
 }

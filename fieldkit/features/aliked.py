@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,29 +20,46 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float32]
 Detected = tuple[Floats, Floats, Floats, Floats]
-WIDTH = 128
 _SIDE_PX = 32
 # As published.
 _MIN_SCORE = 0.2
-# Where detections lie beside what they show: half of how far they move when an image is flipped or turned, over red
-# kitchen frames, rendered images and photos. The variant trained with rotations has the least: "n16" 1.9 and 1.5 px.
-_BIAS_PX = np.array([0.46, -0.04], dtype=np.float32)
 # The window in which a keypoint is the maximum of the scores.
 _WINDOW_PX = 5.0
 
 
-def load_aliked(folder: Path | None) -> Callable[[Image, int], Detected]:
-    """Return the detector with 16 deformable samples and 128 components; raises WeightsError without its weights."""
-    path = find_weights(WEIGHTS["aliked-n16rot"], folder=folder)
+@dataclasses.dataclass(frozen=True)
+class AlikedVariant:
+    """A published network: the name of its weights, the width of its descriptors, and the bias of its keypoints (x, y).
+
+    The bias is where detections lie beside what they show: half of how far they move when an image is flipped or
+    turned. Where it depends on what is shown, nothing is taken off.
+    """
+
+    weights: str
+    width: int
+    bias_px: tuple[float, float] = (0.0, 0.0)
+
+
+# Trained with turned images; measured over red kitchen frames, rendered images and photos.
+N16ROT = AlikedVariant("aliked-n16rot", 128, (0.46, -0.04))
+# What hloc uses; 1.9 and 1.5 px beside.
+N16 = AlikedVariant("aliked-n16", 128)
+# Half as slow; 1.9 px beside.
+T16 = AlikedVariant("aliked-t16", 64)
+
+
+def load_aliked(variant: AlikedVariant, folder: Path | None) -> Callable[[Image, int], Detected]:
+    """Return the detector of a variant; raises WeightsError without its weights."""
+    path = find_weights(WEIGHTS[variant.weights], folder=folder)
     from kornia.feature import ALIKED
 
-    network = ALIKED("aliked-n16rot", detection_threshold=0.0, max_num_keypoints=-1)
+    network = ALIKED(variant.weights, detection_threshold=0.0, max_num_keypoints=-1)
     fill_network(network, read_weights(path), path=path)
-    return one_at_a_time(lambda image, count: _detect(network, image, count))
+    return one_at_a_time(lambda image, count: _detect(network, variant, image, count))
 
 
-def _detect(network: ALIKED, image: Image, max_keypoints: int) -> Detected:
-    """Return keypoints (COLMAP pixels), scores, window sizes and unit descriptors f32[n, 128], strongest first.
+def _detect(network: ALIKED, variant: AlikedVariant, image: Image, max_keypoints: int) -> Detected:
+    """Return keypoints (COLMAP pixels), scores, window sizes and unit descriptors f32[n, width], strongest first.
 
     kornia's own limit would let equal scores decide by chance, and its threshold falls back to noise in an image
     without texture: all maxima are ranked here. It puts the centre of the first pixel at (0, 0): half a pixel is added,
@@ -49,7 +67,7 @@ def _detect(network: ALIKED, image: Image, max_keypoints: int) -> Detected:
     """
     height, width = image.shape[:2]
     if min(height, width) < MIN_SIDE_PX:
-        return no_keypoints(WIDTH)
+        return no_keypoints(variant.width)
     features, score_map = _maps(network, as_tensor(image))
     found: Any = network.dkd(score_map)
     normalised, scores = found[0][0], found[1][0].numpy()
@@ -57,14 +75,15 @@ def _detect(network: ALIKED, image: Image, max_keypoints: int) -> Detected:
     order = strongest(scores, pixels, max_keypoints)
     order = order[scores[order] > _MIN_SCORE]
     if not len(order):
-        return no_keypoints(WIDTH)
+        return no_keypoints(variant.width)
     descriptors = network.desc_head(features, [normalised[order.tolist()]])[0][0].numpy()
     scales = np.full(len(order), _WINDOW_PX, dtype=np.float32)
-    return pixels[order] + (np.float32(0.5) - _BIAS_PX), scores[order], scales, descriptors
+    keypoints = pixels[order] + (np.float32(0.5) - np.array(variant.bias_px, dtype=np.float32))
+    return keypoints, scores[order], scales, descriptors
 
 
 def _maps(network: ALIKED, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return unit features f32[1, 128, h, w] and scores f32[1, 1, h, w], as kornia's `extract_dense_map` does.
+    """Return unit features f32[1, width, h, w] and scores f32[1, 1, h, w], as kornia's `extract_dense_map` does.
 
     With the channels of a pixel side by side in memory, upscaling and normalising take half the time. Sides that are
     no multiple of 32 are continued at the right and bottom by their last pixels.
@@ -80,7 +99,8 @@ def _maps(network: ALIKED, image: torch.Tensor) -> tuple[torch.Tensor, torch.Ten
     fourth = network.block4(network.pool4(third))
 
     # One after the other: a photo of 1600x1200 would need 2 GB for them and what they are joined to.
-    joined = torch.empty((1, WIDTH, *padded.shape[-2:]), memory_format=torch.channels_last)
+    quarter = network.conv1.out_channels
+    joined = torch.empty((1, 4 * quarter, *padded.shape[-2:]), memory_format=torch.channels_last)
     for number, (layer, upsample, x) in enumerate(
         (
             (network.conv1, torch.nn.Identity(), first),
@@ -90,7 +110,7 @@ def _maps(network: ALIKED, image: torch.Tensor) -> tuple[torch.Tensor, torch.Ten
         )
     ):
         narrow = network.gate(layer(x)).contiguous(memory_format=torch.channels_last)
-        joined[:, number * WIDTH // 4 : (number + 1) * WIDTH // 4] = upsample(narrow)
+        joined[:, number * quarter : (number + 1) * quarter] = upsample(narrow)
     scores = torch.sigmoid(network.score_head(joined))
     joined /= torch.linalg.vector_norm(joined, dim=1, keepdim=True).clamp_min(1e-12)
     return joined[..., :height, :width], scores[..., :height, :width].contiguous()

@@ -47,7 +47,7 @@ def localize_files(
             hint="give the priors of these images, by their file names",
         )
     single = files[0] if images.is_file() else None
-    sizes: set[tuple[int, ...]] = set()
+    sizes: dict[Path, tuple[int, ...]] = {}
 
     def one(file: Path) -> Estimate:
         image = read(localizer, file)
@@ -55,17 +55,16 @@ def localize_files(
             if single is not None:
                 raise FeatureError(f"{file}: cannot be read as an image; expected JPEG or PNG", hint="check the file")
             return _without("unreadable")
-        sizes.add(image.shape[:2])
+        sizes[file] = image.shape[:2]
         if image.shape[:2] != (camera.height, camera.width):
             return _without("other_size")
         return localizer.localize_query(Query(image, camera, priors.get(file.name)))
 
     found = list(_counted(in_threads(one, files, threads=threads or default_threads()), len(files), progress))
-    if sizes and (camera.height, camera.width) not in sizes:
-        height, width = sorted(sizes)[0][:2]
+    if sizes and (camera.height, camera.width) not in sizes.values():
+        file = min(sizes)
         raise LocalizeError(
-            f"{files[0] if len(files) == 1 else images}: is {width}x{height}; the camera says "
-            f"{camera.width}x{camera.height}",
+            f"{file}: is {sizes[file][1]}x{sizes[file][0]}; the camera says {camera.width}x{camera.height}",
             hint="give the camera with which the image was taken",
         )
     return [(f.name, e) for f, e in zip(files, found, strict=True)]

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.errors import LocalizeError
-from fieldkit.features import open_extractor, working_factor
+from fieldkit.features import Descriptors, open_extractor, working_factor
+from fieldkit.features.appearance import open_appearance
 from fieldkit.frames import Pose, compose_covariance
 from fieldkit.localize.chance import Agreement, confidence
 from fieldkit.localize.matching import expected_noise, landmark_noise, open_matcher
 from fieldkit.localize.narrowing import CameraPrior, plausible_images
 from fieldkit.localize.parallel import default_threads, in_threads
 from fieldkit.localize.pose import PosedPoints, Solved, estimate_pose, residuals_px
-from fieldkit.localize.retrieval import build_index, most_similar
+from fieldkit.localize.retrieval import build_index, most_similar, nearest_vectors
 from fieldkit.protocol import LocalizerRules
 from fieldkit.store.inputs import RigCamera
 from fieldkit.types import Estimate, Image, SceneMap
@@ -134,12 +135,14 @@ class Localizer:
         self._kind = self._extractor.kind
         self._match = open_matcher(scene_map, self._kind, self._rules, weights=weights)
         self._index = build_index(scene_map, seed=seed)
+        stated = scene_map.retrieval
+        self._appearance = None if stated is None else open_appearance(stated, weights=weights)
         self._shared = shared_errors(scene_map)
 
     @property
     def colour(self) -> bool:
-        """Whether the map's feature looks at colours: give it RGB images then."""
-        return self._kind.colour
+        """Whether the map's feature or retrieval looks at colours: give it RGB images then."""
+        return self._kind.colour or self._appearance is not None
 
     def localize(self, image: Image, camera: Camera, *, prior: CameraPrior | None = None) -> Estimate:
         """Find map_from_cam of an image uint8[h, w] or RGB; a failure is an Estimate without a pose and its reason.
@@ -238,7 +241,7 @@ class Localizer:
         keypoint, landmark = np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
         if len(features) >= rules.min_inliers:
             among = None if query.prior is None else plausible_images(self._map, query.prior, camera)
-            images = most_similar(self._index, features.descriptors, count=rules.top_k, among=among)
+            images = self._retrieve(image, features.descriptors, among)
             watch.stop("retrieve")
             size = camera.width, camera.height
             keypoint, landmark = self._match(features, size, self._index, images, threads)
@@ -257,6 +260,12 @@ class Localizer:
         )
         area_px = camera.width * camera.height * factor**2
         return _Matched(landmark, features.keypoints_px[keypoint], points, factor, area_px, len(features))
+
+    def _retrieve(self, image: Image, descriptors: Descriptors, among: NDArray[np.bool_] | None) -> NDArray[np.int32]:
+        count, vectors = self._rules.top_k, self._map.image_vectors
+        if self._appearance is None or vectors is None:
+            return most_similar(self._index, descriptors, count=count, among=among)
+        return nearest_vectors(vectors, self._appearance.whole(image), count=count, among=among)
 
     def _pose(self, matched: Sequence[_Matched]) -> _Found:
         rules, none = self._rules, tuple(np.zeros(len(m.landmark), dtype=bool) for m in matched)

@@ -1,4 +1,4 @@
-"""Which mapping images look like the query: global descriptors made of the map's own landmark descriptors."""
+"""Which mapping images look like the query: by descriptors of the map's own landmarks, or by a network's of images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
     """Index a map for `most_similar`; the vocabulary is trained on its own descriptors."""
     rows = image_rows(scene_map)
     vocabulary = train_vocabulary(scene_map.descriptors, seed=seed)
-    vectors = np.stack([global_descriptor(vocabulary, scene_map.descriptors[r]) for r in rows])
+    # Written in place: a list of them and its stack would take twice the memory
+    vectors = np.empty((len(rows), vocabulary.centres.size), dtype=np.float32)
+    for i, mine in enumerate(rows):
+        vectors[i] = global_descriptor(vocabulary, scene_map.descriptors[mine])
     return Index(vocabulary, vectors, rows)
 
 
@@ -41,11 +44,11 @@ def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
     landmarks, positions = np.unique(scene_map.descriptor_landmark, return_index=True)
     first[landmarks] = positions
     count = len(scene_map.image_names)
-    seen = _grouped(scene_map.observation_image, count)
+    bounds = np.searchsorted(scene_map.observation_image, np.arange(count + 1))
     own = _grouped(scene_map.descriptor_image, count)
     result = []
     for i in range(count):
-        chosen = first[np.unique(scene_map.observation_landmark[seen[i]])]
+        chosen = first[np.unique(scene_map.observation_landmark[bounds[i] : bounds[i + 1]])]
         borrowed = chosen[chosen >= 0]
         described = scene_map.descriptor_landmark[own[i]]
         borrowed = borrowed[~np.isin(scene_map.descriptor_landmark[borrowed], described)]
@@ -58,8 +61,20 @@ def most_similar(index: Index, descriptors: Descriptors, *, count: int, among: N
 
     Only those in ``among`` bool[k], where it is given.
     """
+    vector = global_descriptor(index.vocabulary, descriptors)
+    return nearest_vectors(index.vectors, vector, count=count, among=among)
+
+
+def nearest_vectors(
+    vectors: NDArray[np.float32],
+    vector: NDArray[np.float32],
+    *,
+    count: int,
+    among: NDArray[np.bool_] | None = None,
+) -> Ints:
+    """Return the indices of the unit vectors f32[k, w] nearest to one f32[w], best first, as `most_similar` does."""
     # Summed by numpy itself: BLAS would start threads for it
-    similarity = np.einsum("kw,w->k", index.vectors, global_descriptor(index.vocabulary, descriptors))
+    similarity = np.einsum("kw,w->k", vectors, vector)
     order = np.argsort(-similarity, kind="stable")
     return (order if among is None else order[among[order]])[:count].astype(np.int32)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from fieldkit.errors import MapError, SurfaceError
 from fieldkit.features import Extractor, Features, feature_name, open_extractor
+from fieldkit.features.appearance import Appearance, open_appearance
 from fieldkit.features.matchers import PairMatcher, open_matcher
 from fieldkit.frames import Pose
 from fieldkit.maps.align import Alignment, Similarity
@@ -41,6 +43,7 @@ from fieldkit.maps.source import MapSource, SourceImage, read_depth, read_image,
 from fieldkit.maps.stages import Stages, resumed, shares
 from fieldkit.maps.strays import strays
 from fieldkit.maps.streamrecorder import open_source
+from fieldkit.maps.whole import FILE, write_global
 from fieldkit.store import atomic_folder, digest, library_versions
 from fieldkit.store.files import refuse_existing
 from fieldkit.surface import fuse_depth, read_ply, write_ply
@@ -80,11 +83,12 @@ def build_map(
         feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
     )
     matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
+    appearance = None if options.retrieval == "own" else open_appearance(options.retrieval, weights=options.weights)
     walk = without_poses(walk) if options.poses == "none" else walk
     versions = library_versions()
     key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
     with resumed(out, key) as stages:
-        with stages.timed("tags"):
+        with stages.timed("tags") if options.tag_sizes_m else contextlib.nullcontext():
             tags = look_for_tags(walk, options, progress=tell)
         with stages.timed("extract"):
             features = _extract_all(walk, extractor, stages, options, tell)
@@ -101,6 +105,8 @@ def build_map(
         told = (*walk.notes, *found.disbelieved, *placing.warnings, *left_out, *missing)
         with stages.timed("write"), atomic_folder(out, force=force, marker="map.toml") as folder:
             _write(folder, walk, model, features, mapped, surface)
+            if appearance is not None:
+                _write_global(folder, walk, mapped, appearance, options, tell)
             made = content_digest(folder)
             places = alignment_entry(alignment), _surface_entry(surface, options)
             write_map_file(folder, MapFile(1, made, feature, *counts, *places))
@@ -189,7 +195,7 @@ def _plausible(found: Matched, options: MapOptions) -> Matched:
     plausible = plausible_matches(found.walk.images, found.features, found.pairs, found.matches, rules=options.slam)
     share = sum(map(len, plausible)) / max(sum(map(len, found.matches)), 1)
     if share < options.slam.least_share:
-        told = f"SLAM's poses fit {100 * share:.0f} % of the matches: not used to rule out the others"
+        told = f"the poses fit {100 * share:.0f} % of the matches: not used to rule out the others"
         return dataclasses.replace(found, disbelieved=(told,))
     return dataclasses.replace(found, matches=plausible)
 
@@ -278,6 +284,21 @@ def _write(
     )
     if surface is not None:
         write_ply(folder / "surface.ply", surface)
+
+
+def _write_global(
+    folder: Path,
+    walk: MapSource,
+    mapped: Mapping[int, Pose],
+    appearance: Appearance,
+    options: MapOptions,
+    tell: Progress,
+) -> None:
+    vectors = {}
+    for done, i in enumerate(mapped, start=1):
+        vectors[walk.images[i].name] = appearance.whole(read_image(walk.images[i], colour=True))
+        tell("describe", done, len(mapped))
+    write_global(folder / FILE, options.retrieval, vectors)
 
 
 def alignment_entry(a: Alignment) -> AlignmentEntry:

@@ -11,6 +11,7 @@ from fieldkit.errors import MapError
 from fieldkit.features import Features
 from fieldkit.maps.io import content_digest, load_map, positive, read_map_file, write_features, write_map_file
 from fieldkit.maps.landmarks import Model, model_from_arrays
+from fieldkit.maps.whole import FILE, write_global
 from fieldkit.store import atomic_folder, refuse_existing
 from fieldkit.surface import coarsen, write_ply
 from fieldkit.types import SceneMap
@@ -49,6 +50,9 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
         (folder / "sparse").mkdir()
         model_from_arrays(model, pixels).write_binary(folder / "sparse")
         write_features(folder / "features.h5", features, sizes, compress=True)
+        if scene_map.retrieval is not None and scene_map.image_vectors is not None:
+            vectors = dict(zip(scene_map.image_names, scene_map.image_vectors, strict=True))
+            write_global(folder / FILE, scene_map.retrieval, vectors)
         surface_entry = entry.surface
         if scene_map.surface is not None and surface_entry is not None:
             surface = coarsen(scene_map.surface, voxel_m=voxel_m)

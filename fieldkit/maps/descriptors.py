@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,11 @@ from fieldkit.errors import MapError
 from fieldkit.maps.landmarks import Model
 from fieldkit.observations import observations_of
 
-# Room for two 8-bit SIFT descriptors of each of a million landmarks
-MAX_BYTES = 256 << 20
+# Room for 1.3 8-bit SIFT descriptors of each of a million landmarks: all of such a map then fits into a gigabyte
+MAX_BYTES = 160 << 20
+_MAX_RANK = 255
+# glibc, malloc.h
+_M_MMAP_THRESHOLD = -3
 
 
 def read_landmark_descriptors(
@@ -28,6 +33,8 @@ def read_landmark_descriptors(
     many as fit, but at least one: those of the most different views. Raises MapError when the file is missing or
     damaged, is of other images or keypoints, or of a feature of another width.
     """
+    if Path(path).is_file() and Path(path).stat().st_size > max_bytes:
+        _give_back_freed_memory()
     try:
         with h5py.File(path, "r") as file:
             dtype = _check(path, file, model, width)
@@ -36,14 +43,18 @@ def read_landmark_descriptors(
                 values, filled = _read(file, model, np.arange(n), dtype, width)
                 return (values, np.arange(n)) if filled.all() else (values[filled], np.flatnonzero(filled))
             described = _described(file, model)
-            rows = described[
-                _view_rank(model, described) < _count(model, described, max_bytes // (width * dtype.itemsize))
-            ]
+            rows = _chosen(model, described, max_bytes // (width * dtype.itemsize))
             return _read(file, model, rows, dtype, width)[0], rows
     except (OSError, KeyError, AttributeError) as error:
         raise MapError(
             f"{path}: cannot be read: {error}; expected features as hloc writes them", hint="build the map again"
         ) from error
+
+
+def _give_back_freed_memory() -> None:
+    """Have the C library return freed arrays to the system at once: by itself glibc keeps those below 32 MB."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1 << 18)
 
 
 def _check(path: Path, file: h5py.File, model: Model, width: int) -> np.dtype[Any]:
@@ -99,13 +110,23 @@ def _described(file: h5py.File, model: Model) -> NDArray[np.int64]:
     return np.flatnonzero(filled)
 
 
-def _count(model: Model, described: NDArray[np.int64], room: int) -> int:
-    """Return how many descriptors of each landmark fit into ``room`` rows, at least 1."""
-    owned = np.bincount(model.observation_landmark[described])
+def _chosen(model: Model, described: NDArray[np.int64], room: int) -> NDArray[np.int64]:
+    """Return the observations, ascending, whose descriptors fit into ``room`` rows: at least one per landmark.
+
+    Of what room is left, the landmarks that most images saw get one more.
+    """
+    owned = np.bincount(model.observation_landmark[described], minlength=len(model.xyz))
     count = 1
-    while count < min(int(owned.max(initial=0)), 255) and np.minimum(owned, count + 1).sum() <= room:
+    while count < _MAX_RANK and np.minimum(owned, count + 1).sum() <= room:
         count += 1
-    return count
+    rank = _view_rank(model, described)
+    kept = rank < count
+    left = room - int(kept.sum())
+    if left > 0:
+        further = np.flatnonzero(rank == count)
+        seen = owned[model.observation_landmark[described[further]]]
+        kept[further[np.argsort(-seen, kind="stable")[:left]]] = True
+    return described[kept]
 
 
 def _view_rank(model: Model, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -160,7 +181,7 @@ def _rank_one(views, mean, members, rank):  # type: ignore[no-untyped-def]
         if d < least:
             chosen, least = k, d
     for number in range(n):
-        rank[members[chosen]] = min(number, 255)
+        rank[members[chosen]] = min(number, _MAX_RANK)
         away[chosen] = -1.0
         following, most = chosen, -1.0
         for k in range(n):

@@ -14,8 +14,9 @@ import numpy as np
 
 from fieldkit.errors import MapError, suggestion
 from fieldkit.features import FEATURES, Features
+from fieldkit.maps import whole
 from fieldkit.maps.colmap import read_model
-from fieldkit.maps.descriptors import read_landmark_descriptors
+from fieldkit.maps.descriptors import MAX_BYTES, read_landmark_descriptors
 from fieldkit.maps.landmarks import landmark_covariance
 from fieldkit.maps.record import read_record
 from fieldkit.store import digest, read_toml, write_toml
@@ -87,8 +88,9 @@ def positive(name: str, value: float) -> None:
 
 
 def content_digest(folder: Path) -> str:
-    """Return the digest over model, features and surface of a map folder."""
-    files = [*(folder / "sparse" / name for name in _MODEL_FILES), folder / "features.h5", folder / "surface.ply"]
+    """Return the digest over model, features, surface and global descriptors of a map folder."""
+    names = (*(f"sparse/{name}" for name in _MODEL_FILES), "features.h5", "surface.ply", whole.FILE)
+    files = [folder / name for name in names]
     parts: list[bytes | str | Path] = []
     for file in files:
         if file.is_file():
@@ -149,14 +151,16 @@ def load_map(path: Path) -> SceneMap:
     width = FEATURES[entry.feature].width
     descriptors, rows = read_landmark_descriptors(path / "features.h5", model, width=width)
     every = len(rows) == len(model.observation_landmark)
+    retrieval, vectors = whole.read_global(path / whole.FILE, model.image_names) or (None, None)
+    covariance = landmark_covariance(
+        model.xyz, model.observation_landmark, model.observation_image, model.map_from_image, model.image_cameras
+    )
     return SceneMap(
         path=str(path),
         digest=entry.digest,
         feature=entry.feature,
         xyz=model.xyz,
-        xyz_covariance=landmark_covariance(
-            model.xyz, model.observation_landmark, model.observation_image, model.map_from_image, model.image_cameras
-        ),
+        xyz_covariance=covariance if descriptors.nbytes < MAX_BYTES // 2 else covariance.astype(np.float32),
         image_names=model.image_names,
         image_cameras=model.image_cameras,
         map_from_image=model.map_from_image,
@@ -167,6 +171,8 @@ def load_map(path: Path) -> SceneMap:
         descriptor_landmark=model.observation_landmark if every else model.observation_landmark[rows],
         descriptor_image=model.observation_image if every else model.observation_image[rows],
         surface=_read_surface(path, entry.surface),
+        retrieval=retrieval,
+        image_vectors=vectors,
     )
 
 

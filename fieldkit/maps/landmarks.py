@@ -154,7 +154,7 @@ def landmark_covariance(
     for i, rows in observations_of(observation_image, len(map_from_image)):
         jacobian = projection_jacobian(xyz[observation_landmark[rows]], map_from_image[i], image_cameras[i])
         np.add.at(information, observation_landmark[rows], np.einsum("nki,nkj->nij", jacobian, jacobian) / noise_px**2)
-    # In parts and in place: of a million landmarks two copies are a seventh of a gigabyte
+    # In parts: of a million landmarks two copies are a seventh of a gigabyte
     for begin in range(0, len(xyz), _INVERTED_TOGETHER):
         part = slice(begin, begin + _INVERTED_TOGETHER)
         information[part] = np.linalg.inv(information[part])

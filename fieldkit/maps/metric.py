@@ -18,7 +18,7 @@ from fieldkit.maps.source import DepthFrame, MapSource
 Array = NDArray[np.float64]
 ReadDepth = Callable[[DepthFrame], NDArray[np.uint16]]
 
-_MIN_SAMPLES = 200
+_MIN_SAMPLES, _MIN_OF_FRAME = 200, 20
 _MAX_CHANGE = 0.05
 _RANGE_M = (0.4, 5.0)
 # Depth may change this much around a landmark; more is an edge, where landmark and pixel may lie on two surfaces.
@@ -27,7 +27,7 @@ _FLAT = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class DepthScale:
-    """Measured depth over mapped depth: median ratio over n landmarks, and the standard deviation of that median.
+    """Measured depth over mapped depth: median ratio over n landmarks, and the relative standard deviation of that.
 
     ``n_used`` of them are within three standard deviations; ``rms_m`` of those and ``p95_m`` of all are how far
     measured and mapped depth differ after scaling, in m.
@@ -78,12 +78,26 @@ def depth_scale(walk: MapSource, model: Model, mapped: Mapping[int, Pose], *, re
     used = np.abs(values - ratio) <= 3.0 * max(spread, 1e-9)
     return DepthScale(
         ratio,
-        1.2533 * spread / float(np.sqrt(len(values))) / ratio,
+        _sigma([r[0] for r in ratios], spread) / ratio,
         len(values),
         int(used.sum()),
         float(np.sqrt(np.mean(off[used] ** 2))),
         float(np.percentile(off, 95)),
     )
+
+
+def _sigma(by_frame: list[Array], spread: float) -> float:
+    """Return the standard deviation of the median of all ratios.
+
+    As if each were by itself, or, where that is more, as the medians of the frames differ: what a depth image is off
+    by, its landmarks share.
+    """
+    alone = 1.2533 * spread / float(np.sqrt(sum(map(len, by_frame))))
+    medians = np.array([np.median(r) for r in by_frame if len(r) >= _MIN_OF_FRAME])
+    if len(medians) < 3:
+        return alone
+    apart = 1.4826 * float(np.median(np.abs(medians - np.median(medians))))
+    return max(alone, 1.2533 * apart / float(np.sqrt(len(medians))))
 
 
 def with_depth_scale(

@@ -27,6 +27,7 @@ class MapOptions:
     of any (by id, None for all others), else depth images where there are any, else SLAM; "slam", "tags" and "depth"
     take just those. ``slam`` says how far SLAM's poses are trusted to rule out matches; None takes all matches.
     ``n_similar`` is to how many similar images every image is matched, by default what the matcher is fast enough for.
+    ``retrieval`` says by what a query finds its mapping images: their landmarks' own descriptors, or a network's.
     ``weights`` is a folder where networks' weights are looked for first, ``n_threads`` by default the number of
     processors, which does not change the map, and ``keep_record`` writes seconds and versions into the map folder:
     these three are no part of what the options are told by.
@@ -37,6 +38,7 @@ class MapOptions:
     max_keypoints: int = 2048
     max_image_size: int | None = 1600
     matcher: MatcherName = "nearest"
+    retrieval: Literal["own", "efficientnet", "dinov2"] = "own"
     ratio: float = 0.8
     n_similar: int | None = None
     n_neighbours: int = 3

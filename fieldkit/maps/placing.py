@@ -24,7 +24,7 @@ from fieldkit.maps.plausible import SlamRules, plausible_pairs
 from fieldkit.maps.sfm import quiet_colmap, reconstruct, relative_poses, threads, write_verified
 from fieldkit.maps.source import MapSource
 from fieldkit.maps.stages import Stages
-from fieldkit.maps.strays import contradicting
+from fieldkit.maps.strays import folded
 from fieldkit.tags import TagDetection
 
 # A few misplaced images are left out; of more than this share the rest is bent too, and SfM starts again.
@@ -49,7 +49,10 @@ class Matched:
 
 @dataclasses.dataclass(frozen=True)
 class Placing:
-    """A model with its poses sfm_from_cam, its alignment, and how many images are not where SLAM saw them."""
+    """A model with its poses sfm_from_cam, its alignment, and how many images are not where SLAM saw them.
+
+    Those where SLAM is what leaps do not count.
+    """
 
     model: pycolmap.Reconstruction
     sfm_poses: Mapping[int, Pose]
@@ -96,7 +99,10 @@ def place_once(
     def grow(database: Path) -> Sequence[pycolmap.Reconstruction]:
         try:
             if options.poses == "known":
-                return [triangulate(database, walk.images)]
+                progress("triangulate", 0, 1)
+                model = triangulate(database, walk.images)
+                progress("triangulate", 1, 1)
+                return [model]
             return reconstruct(database, walk.images, seed=seed, progress=progress)
         except MapError as error:
             raise MapError(f"{walk.path}: {error.message}", hint=error.hint) from error
@@ -112,7 +118,7 @@ def place_once(
     with stages.timed("align"):
         alignment, warnings = find_frame(walk, model, poses, options, tags=found.tags, seed=seed, match_share=share)
         mapped = {i: alignment.map_from_sfm.pose(p) for i, p in poses.items()}
-        far = contradicting(walk.images, mapped, threshold_m=alignment.threshold_m)
+        far = folded(walk.images, mapped, threshold_m=alignment.threshold_m)
     return Placing(model, poses, alignment, (*pieces, *warnings), len(far))
 
 
@@ -165,8 +171,8 @@ def _registered(
     others = [left for piece in pieces[1:] if (left := sorted(set(piece) - set(poses)))]
     apart = "".join(f"; {len(left)} others ({_named(walk, left)}) hang together by themselves" for left in others)
     if options.poses == "known":
-        lost = walk.n_posed
-        return poses, [f"{lost} of {len(walk.images)} images have a pose"] if lost < len(walk.images) else []
+        posed = f"{walk.n_posed} of {len(walk.images)} images have a pose"
+        return poses, [] if walk.n_posed == len(walk.images) else [posed]
     if len(poses) < max(3, options.min_registered * len(walk.images)):
         raise MapError(
             f"{walk.path}: {len(poses)} of {len(walk.images)} images registered{apart}; expected at least half, and 3",

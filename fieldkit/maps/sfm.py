@@ -22,7 +22,7 @@ from fieldkit.maps.source import SourceImage
 # Below this number of verified matches a pair is not used (COLMAP's own bound).
 _MIN_MATCHES = 15
 # Pairs that are verified between two tellings of progress
-_SHARE = 1000
+_SHARE = 500
 
 Progress = Callable[[str, int, int], None]
 

@@ -29,6 +29,22 @@ def strays(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, t
     corridor may on a place nearer by, the detour is the longer in the right one: there the steps tell into the piece
     and out of it, a leap in the wrong one. With one image of a rig's frame all of the frame are returned.
     """
+    wrong, _ = _judged(images, map_from_cam, threshold_m)
+    frames = {images[i].frame for i in wrong if images[i].rig_from_cam is not None}
+    together = {i for i in map_from_cam if images[i].rig_from_cam is not None and images[i].frame in frames}
+    return sorted(wrong | together)
+
+
+def folded(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, threshold_m: float) -> set[int]:
+    """Return the images (by index) that contradict SLAM, but for those where SLAM is what leaps."""
+    _, slams = _judged(images, map_from_cam, threshold_m)
+    return contradicting(images, map_from_cam, threshold_m=threshold_m) - slams
+
+
+def _judged(
+    images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], threshold_m: float
+) -> tuple[set[int], set[int]]:
+    """Return the contradicting images that the map has in the wrong place, and those that SLAM has."""
     posed = [i for i in map_from_cam if images[i].slam_from_cam is not None]
     mapped = {i: np.asarray(map_from_cam[i].translation) for i in posed}
     slam = {i: _position(images[i]) for i in posed}
@@ -36,19 +52,18 @@ def strays(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, t
     sequences: dict[str, list[int]] = {}
     for i in posed:
         sequences.setdefault(images[i].sequence, []).append(i)
-    wrong = set()
+    wrong, slams = set[int](), set[int]()
     for members in sequences.values():
         order = walk_order(images, members)
         for piece, steps in _pieces(order, far):
             ends = [j for step in steps for j in step if j not in far]
             leaps = _leaps(mapped, piece, steps), _leaps(slam, piece, steps)
             if ends and len(piece) >= _PIECE and max(leaps) > _LEAP * min(leaps) + threshold_m:
-                wrong |= set(piece) if leaps[0] > leaps[1] else set()
+                (wrong if leaps[0] > leaps[1] else slams).update(piece)
             else:
                 wrong |= {i for i in piece if _goes_farther(mapped, slam, i, ends)}
-    frames = {images[i].frame for i in wrong if images[i].rig_from_cam is not None}
-    together = {i for i in map_from_cam if images[i].rig_from_cam is not None and images[i].frame in frames}
-    return sorted(wrong | together)
+                slams |= {i for i in piece if _goes_farther(slam, mapped, i, ends)}
+    return wrong, slams
 
 
 def contradicting(images: Sequence[SourceImage], map_from_cam: Mapping[int, Pose], *, threshold_m: float) -> set[int]:
@@ -86,7 +101,7 @@ def _position(image: SourceImage) -> Array:
     return np.asarray(image.slam_from_cam.translation)
 
 
-def _goes_farther(mapped: Mapping[int, Array], slam: Mapping[int, Array], i: int, ends: Sequence[int]) -> bool:
-    """Tell whether the way from the ends of its piece to an image is longer in the map than by SLAM."""
-    way = [sum(float(np.linalg.norm(position[i] - position[j])) for j in ends) for position in (mapped, slam)]
+def _goes_farther(here: Mapping[int, Array], there: Mapping[int, Array], i: int, ends: Sequence[int]) -> bool:
+    """Tell whether the way from the ends of its piece to an image is longer here than there."""
+    way = [sum(float(np.linalg.norm(position[i] - position[j])) for j in ends) for position in (here, there)]
     return way[0] > way[1]

@@ -201,9 +201,23 @@ def _provenance(run: Run) -> tuple[tuple[str, str], ...]:
         ("Map digest", run.map_digest or "none"),
         ("Tags digest", run.tags_digest or "none"),
         ("Corrections", "; ".join(f"{c.kind}: {c.path} ({c.digest})" for c in run.corrections) or "none"),
+        ("Seconds", _seconds_words(run)),
         ("Seed", str(run.seed)),
         ("Versions", ", ".join(f"{name} {version}" for name, version in sorted(run.versions.items())) or "none"),
     )  # fmt: skip
+
+
+def _seconds_words(run: Run) -> str:
+    """Return the seconds per stage of building the map, and the median ones of localizing a view."""
+    views = [dict(r.estimate.seconds) for r in run.results if r.estimate.seconds]
+    stages = dict.fromkeys(stage for seconds in views for stage in seconds)
+    medians = {s: float(np.median([v[s] for v in views if s in v])) for s in stages}
+    told = [
+        f"{what}: {', '.join(f'{stage} {value:.3g}' for stage, value in seconds.items())}"
+        for what, seconds in (("map", run.map_seconds), ("view (median)", medians))
+        if seconds
+    ]
+    return "; ".join(told) or "not known"
 
 
 def _localizer_words(run: Run) -> str:

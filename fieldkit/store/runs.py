@@ -82,6 +82,7 @@ class _RunFile(msgspec.Struct, forbid_unknown_fields=True):
     sessions: list[str]
     excluded: list[Excluded]
     corrections: list[Applied] = []
+    map_seconds: dict[str, float] = {}
 
 
 def write_run(path: Path, run: Run, *, force: bool = False) -> None:
@@ -90,6 +91,7 @@ def write_run(path: Path, run: Run, *, force: bool = False) -> None:
         head = _RunFile(
             1, protocols.to_dict(run.protocol), run.map_digest, run.tags_digest, list(run.recordings), run.seed,
             dict(run.versions), list(run.sessions), list(run.excluded), list(run.corrections),
+            dict(run.map_seconds),
         )  # fmt: skip
         write_table(folder / "trials.csv", TRIALS, (_trial_cells(t) for t in run.trials))
         write_table(folder / "estimates.csv", ESTIMATES, (_result_cells(r) for r in run.results))
@@ -133,6 +135,7 @@ def read_run(path: Path) -> Run:
         path=str(path),
         tags=read_tags(path / TAGS_FILE) if (path / TAGS_FILE).is_file() else None,
         corrections=tuple(head.corrections),
+        map_seconds=head.map_seconds,
     )
 
 

@@ -26,19 +26,21 @@ class Surface:
 class SceneMap:
     """Landmarks in the metric, gravity aligned map frame, who saw them from where, and their descriptors.
 
-    Landmarks (n): ``xyz`` f64[n, 3] in m; ``xyz_covariance`` f64[n, 3, 3] in m^2.
+    Landmarks (n): ``xyz`` f64[n, 3] in m; ``xyz_covariance`` f64[n, 3, 3] in m^2, f32 in large maps.
     Mapping images (k): ``image_names``, ``image_cameras``, ``map_from_image`` poses (camera in the map).
     Observations (o), sorted by image: ``observation_landmark`` int32[o], ``observation_image`` int32[o],
     ``observation_px`` f32[o, 2].
     Descriptors (d): ``descriptors`` uint8 or float32[d, width], ``descriptor_landmark`` int32[d],
     ``descriptor_image`` int32[d]; a compact map has one per landmark.
+    ``retrieval``: the network that made ``image_vectors`` f32[k, w], unit vectors of whole mapping images; None where
+    images are compared by their landmarks' descriptors.
     """
 
     path: str
     digest: str
     feature: str
     xyz: Array
-    xyz_covariance: Array
+    xyz_covariance: Array | NDArray[np.float32]
     image_names: tuple[str, ...]
     image_cameras: tuple[Camera, ...]
     map_from_image: tuple[Pose, ...]
@@ -49,6 +51,8 @@ class SceneMap:
     descriptor_landmark: NDArray[np.int32]
     descriptor_image: NDArray[np.int32]
     surface: Surface | None = None
+    retrieval: str | None = None
+    image_vectors: NDArray[np.float32] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -166,6 +166,7 @@ class Run:
     """A finished replay: everything that scoring and the report need, without images, bag or map.
 
     ``tags`` are those it was replayed with, None where it needed none or an older run does not hold them.
+    ``map_seconds`` are those of building the map, per stage, where the map says so.
     """
 
     protocol: Protocol
@@ -185,3 +186,4 @@ class Run:
     path: str = ""
     tags: TagMap | None = None
     corrections: tuple[Applied, ...] = ()
+    map_seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
