@@ -28,8 +28,9 @@ demo: install
 	$(BIN)/fieldkit score $(DEMO)/run
 
 # On small matrices BLAS's threads wait for each other, the longer the busier the machine is.
+# A process per processor; the tests of one file share their fixtures, and so a process.
 test: install
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 # Foreign readers for tests/test_foreign_judges.py, which skips without them: Foxglove's, into tests/judges/node_modules,
 # and ROS 1's own, which Debian has: apt-get install python3-rosbag python3-{std,sensor,nav,geometry,tf2}-msgs

@@ -62,8 +62,12 @@ def map_build(
         tag_families=family or ("tag36h11",),
         voxel_m=voxel_m,
     )
-    with ProgressBars() as progress:
-        built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
+    try:
+        with ProgressBars() as progress:
+            built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
+    except KeyboardInterrupt:
+        _log.warning("%s: interrupted; the same command goes on where it stopped", out)
+        raise
     for warning in built.warnings:
         _log.warning("%s: %s", source, warning)
     print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")
@@ -91,6 +95,7 @@ def map_import(
     mesh_up: Literal["y", "z"] = "z",
     mesh_voxel_m: float | None = None,
     min_images: int = 4,
+    retriangulate: bool = False,
     force: bool = False,
 ) -> None:
     """Make a map of a COLMAP or hloc model: metric frame, landmarks with descriptors, and a mesh as surface.
@@ -116,6 +121,7 @@ def map_import(
         mesh_up: axis of the mesh that points up
         mesh_voxel_m: resolution of the mesh; by default its median edge, within 0.01..0.10 m
         min_images: images that have to see a point to make it a landmark
+        retriangulate: keep the model's cameras and poses only, and find landmarks by --feature anew
         force: replace an existing map
     """
     from fieldkit import maps
@@ -125,7 +131,7 @@ def map_import(
     sizes_m = parse_sizes(size_m) if size_m else {}
     frame = maps.FrameOptions(poses, scale, up, sizes_m, family or ("tag36h11",), depth, depth_camera)
     rules = maps.LandmarkRules(min_images=min_images)
-    options = maps.ImportOptions(feature, frame, features, database, meshed, rules, weights)
+    options = maps.ImportOptions(feature, frame, features, database, meshed, rules, weights, retriangulate)
     with ProgressBars() as progress:
         built = maps.import_map(model, out, images=images, options=options, force=force, progress=progress)
     for warning in built.warnings:

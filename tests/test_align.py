@@ -11,8 +11,8 @@ from synthetic_map import looking
 
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose, exp, pose_error
-from fieldkit.maps.align import align_to_slam, robust_similarity, umeyama
-from fieldkit.maps.motion import motion_scale
+from fieldkit.maps.metric.align import align_to_slam, robust_similarity, umeyama
+from fieldkit.maps.metric.motion import motion_scale
 
 ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7])
 

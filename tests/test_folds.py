@@ -13,13 +13,13 @@ from synthetic_map import CAMERA, looking
 from fieldkit.errors import MapError
 from fieldkit.features import Features
 from fieldkit.frames import Pose, exp
-from fieldkit.maps.options import MapOptions
-from fieldkit.maps.placing import Matched, place_once, unfolded
-from fieldkit.maps.plausible import SlamRules, plausible_pairs
-from fieldkit.maps.sfm import relative_poses
-from fieldkit.maps.source import MapSource, SourceImage
+from fieldkit.maps.options import MapOptions, SlamRules
+from fieldkit.maps.sources.source import MapSource, SourceImage
 from fieldkit.maps.stages import Stages
-from fieldkit.maps.strays import contradicting, folded, strays
+from fieldkit.maps.structure.placing import Matched, place_once, unfolded
+from fieldkit.maps.structure.plausible import plausible_pairs
+from fieldkit.maps.structure.sfm import relative_poses
+from fieldkit.maps.structure.strays import contradicting, folded, strays
 
 PLACES = [looking(np.array([x, 0.0, 1.5]), np.pi / 2) for x in (0.0, 1.0)]
 ELSEWHERE = PLACES[1] * exp([0.0, 0.0, 0.0, 0.0, 0.0, 3.0])

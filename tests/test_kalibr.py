@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import StoreError
 from fieldkit.frames import Pose, pose_error
-from fieldkit.maps.source import read_source
+from fieldkit.maps.sources.source import read_source
 from fieldkit.store import calibration_file, read_camera, read_rig, write_tum
 
 CAM0 = """cam0:

@@ -24,7 +24,7 @@ from fieldkit.localize.chance import Agreement, confidence, log_false_alarms
 from fieldkit.localize.files import localize_files, localize_rig_files
 from fieldkit.localize.matching import _merged, features_of
 from fieldkit.localize.narrowing import plausible_images
-from fieldkit.localize.pose import _between, estimate_pose
+from fieldkit.localize.pose import _between, estimate_pose, refine_pose
 from fieldkit.localize.retrieval import build_index
 from fieldkit.protocol import LocalizerRules
 from fieldkit.store.inputs import Rig, RigCamera, write_camera, write_rig, write_tum
@@ -214,6 +214,17 @@ def test_poses_that_fit_alike_are_all_within_the_covariance() -> None:
     assert np.sqrt(alike[1, 1]) == pytest.approx(0.3 / np.sqrt(2))
     assert np.sqrt(worse[3, 3]) < 0.01
     assert not _between(here, [here, here, here], [20.0, 20.0, 21.0]).any()
+
+
+def test_landmarks_that_are_hardly_known_along_their_rays_do_no_harm(rng: np.random.Generator) -> None:
+    truth, points = scene(rng)
+    rays = points.xyz - truth.translation
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    long = 1e8 * np.einsum("ni,nj->nij", rays, rays) + 1e-10 * np.eye(3)
+    start = truth * exp([0.5, 0.4, 0.3, 3.0, 2.0, 3.0])
+    found, covariance, _ = refine_pose([dataclasses.replace(points, xyz_covariance=long)], start, noise=1.0)
+    assert np.isfinite(found.as_matrix()).all()
+    assert np.isfinite(covariance).all()
 
 
 def test_large_keypoints_count_less_than_small_ones(rng: np.random.Generator) -> None:

@@ -18,8 +18,8 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError
 from fieldkit.frames import Pose
 from fieldkit.maps import build_map, load_map
-from fieldkit.maps.headers import ImageHeader, read_header
-from fieldkit.maps.source import read_source
+from fieldkit.maps.sources.headers import ImageHeader, read_header
+from fieldkit.maps.sources.source import read_source
 from fieldkit.store import Rig, RigCamera, write_camera, write_rig, write_tum
 
 SIZE = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))

@@ -7,19 +7,29 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_map import CAMERA, looking
 from test_align import ROTATION, as_sfm, walk
-from tiny_walk import TAG_M, write_walk
+from tiny_walk import TAG_M, view, write_walk
 
 from fieldkit.errors import MapError, TagError
 from fieldkit.frames import Pose, exp, pose_error
-from fieldkit.maps import MapOptions, build_map, fit_gauge, load_map, map_info
-from fieldkit.maps.tagged import TagScale, tag_scale
-from fieldkit.maps.upright import level_cameras, up_rotation
-from fieldkit.store import write_tum
+from fieldkit.maps import (
+    FrameOptions,
+    ImportOptions,
+    MapOptions,
+    build_map,
+    fit_gauge,
+    import_map,
+    load_map,
+    map_info,
+)
+from fieldkit.maps.metric.tagged import TagScale, tag_scale
+from fieldkit.maps.metric.upright import level_cameras, up_rotation
+from fieldkit.store import Rig, RigCamera, read_camera, write_rig, write_tum
 from fieldkit.tags import TagDetection, tag_corners
 
 QUICK = MapOptions(max_keypoints=700)
@@ -87,6 +97,45 @@ def test_known_poses_stay_as_they_are(room: tuple[Path, Mapping[str, Pose]], tmp
     assert len(scene_map.xyz) > 200
     walls = np.abs(scene_map.xyz[:, :2]) / (2.0, 1.6)
     assert np.median(np.abs(walls.max(axis=1) - 1.0)) < 0.01
+
+
+def test_an_imported_model_is_triangulated_anew_by_another_feature(
+    room: tuple[Path, Mapping[str, Pose]], tmp_path: Path
+) -> None:
+    source, true = room
+    build_map(source, tmp_path / "m", options=dataclasses.replace(QUICK, poses="known"))
+    options = ImportOptions("akaze", FrameOptions(scale=1.0), retriangulate=True)
+    report = import_map(tmp_path / "m", tmp_path / "again", images=source / "images", options=options)
+    scene_map = load_map(tmp_path / "again")
+    assert scene_map.feature == "akaze"
+    assert report.n_landmarks == len(scene_map.xyz) > 100
+    for name, pose in zip(scene_map.image_names, scene_map.map_from_image, strict=True):
+        assert max(pose_error(pose, true[name])) < 1e-6
+
+
+def test_the_frames_of_a_rig_stay_where_their_known_poses_are(
+    room: tuple[Path, Mapping[str, Pose]], tmp_path: Path
+) -> None:
+    source, true = room
+    ahead, beside = Pose.identity(), exp([0.0, 0.3, 0.0, 0.1, 0.0, 0.0])
+    camera = read_camera(source / "camera.toml")
+    write_rig(tmp_path / "rig.toml", Rig((RigCamera("a", camera, ahead), RigCamera("b", camera, beside))))
+    frames = sorted(true)[::2]
+    for name, at in (("a", ahead), ("b", beside)):
+        (tmp_path / "images" / name).mkdir(parents=True)
+        for frame in frames:
+            image = view(true[frame] * at)
+            assert cv2.imwrite(str(tmp_path / "images" / name / frame), image)
+    write_tum(tmp_path / "slam_poses.txt", [(Path(frame).stem, true[frame]) for frame in frames])
+    options = dataclasses.replace(QUICK, poses="known")
+    report = build_map(tmp_path, tmp_path / "rig.map", options=options)
+    scene_map = load_map(tmp_path / "rig.map")
+    for name, pose in zip(scene_map.image_names, scene_map.map_from_image, strict=True):
+        expected = true[Path(name).name] * (beside if name.startswith("b/") else ahead)
+        assert max(pose_error(pose, expected)) < 1e-6
+    assert len(scene_map.image_names) == 16
+    assert report.alignment.match_share is not None
+    assert report.alignment.match_share > 0.85
 
 
 @pytest.mark.parametrize(("sigma_rad", "sigma_m"), [(0.01, 0.01), (0.05, 0.3)])

@@ -31,11 +31,11 @@ from fieldkit.maps import (
     load_map,
     map_info,
 )
-from fieldkit.maps.align import Similarity
 from fieldkit.maps.colmap import model_folder, read_model, write_model
 from fieldkit.maps.descriptors import read_landmark_descriptors
 from fieldkit.maps.landmarks import Model, model_arrays
-from fieldkit.maps.stamps import match_names
+from fieldkit.maps.metric.align import Similarity
+from fieldkit.maps.sources.stamps import match_names
 from fieldkit.store import write_tum
 from fieldkit.types import SceneMap
 

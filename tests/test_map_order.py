@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from fieldkit.cameras import Camera
 from fieldkit.features import Features
 from fieldkit.frames import Pose
-from fieldkit.maps.order import walk_order
-from fieldkit.maps.plausible import SlamRules, plausible_matches
-from fieldkit.maps.source import SourceImage
-from fieldkit.maps.strays import strays
+from fieldkit.maps.options import SlamRules
+from fieldkit.maps.sources.order import walk_order
+from fieldkit.maps.sources.source import SourceImage
+from fieldkit.maps.structure.plausible import plausible_matches
+from fieldkit.maps.structure.strays import strays
 
 CAMERA = Camera("PINHOLE", 320, 240, (240.0, 240.0, 160.0, 120.0))
 LEVEL = Rotation.from_euler("x", -90, degrees=True)

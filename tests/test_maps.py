@@ -24,11 +24,12 @@ from fieldkit.frames import Pose, exp, pose_error, pose_from_matrix
 from fieldkit.localize import Localizer
 from fieldkit.maps import MapOptions, build_map, compact_map, content_digest, load_map, map_info
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, landmark_covariance, model_arrays, model_from_arrays
-from fieldkit.maps.pairs import choose_pairs
-from fieldkit.maps.plausible import SlamRules, plausible_matches
-from fieldkit.maps.rigs import write_cameras
-from fieldkit.maps.source import SourceImage, read_source
-from fieldkit.maps.strays import strays
+from fieldkit.maps.options import SlamRules
+from fieldkit.maps.sources.source import SourceImage, read_source
+from fieldkit.maps.structure.pairs import choose_pairs
+from fieldkit.maps.structure.plausible import plausible_matches
+from fieldkit.maps.structure.rigs import write_cameras
+from fieldkit.maps.structure.strays import strays
 from fieldkit.store import Rig, RigCamera, write_camera, write_rig, write_tum
 from fieldkit.types import Surface
 

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity
 from fieldkit.maps.landmarks import Model
-from fieldkit.maps.metric import DepthScale, depth_scale, with_depth_scale
-from fieldkit.maps.source import DepthFrame, MapSource, SourceImage
+from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.metric.depth import DepthScale, depth_scale, with_depth_scale
+from fieldkit.maps.sources.source import DepthFrame, MapSource, SourceImage
 
 CAMERA = Camera("PINHOLE", 160, 120, (120.0, 120.0, 80.0, 60.0))
 

@@ -26,7 +26,7 @@ from fieldkit.features.matchers import open_matcher
 from fieldkit.features.matching import match_pair
 from fieldkit.features.superpoint import local_maxima, maps, superpoint_network
 from fieldkit.features.weights import WEIGHTS
-from fieldkit.maps.pairs import match_pairs
+from fieldkit.maps.structure.pairs import match_pairs
 
 PHOTO = Path(__file__).parents[1] / "docs" / "room.jpg"
 

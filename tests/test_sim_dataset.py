@@ -17,7 +17,7 @@ from fieldkit.frames import log, pose_error
 from fieldkit.judge import nearest_distance
 from fieldkit.maps import MapOptions, build_map, load_map
 from fieldkit.maps.gauge import fit_gauge
-from fieldkit.maps.source import read_source
+from fieldkit.maps.sources.source import read_source
 from fieldkit.types import Surface
 from sim_bridge.cli import main
 from sim_bridge.dataset import DatasetOptions, MeshSource, SceneOptions, SceneSource, make_scenes

@@ -14,8 +14,8 @@ from test_streamrecorder import session
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
 from fieldkit.frames import pose_error
-from fieldkit.maps.source import SourceImage, read_depth, read_image, read_source
-from fieldkit.maps.streamrecorder import fit_camera, is_streamrecorder, open_source, read_streamrecorder
+from fieldkit.maps.sources.source import SourceImage, read_depth, read_image, read_source
+from fieldkit.maps.sources.streamrecorder import fit_camera, is_streamrecorder, open_source, read_streamrecorder
 from sim_bridge.mapping.streamrecorder import export_streamrecorder
 
 __all__ = ["session"]

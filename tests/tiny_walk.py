@@ -12,12 +12,19 @@ from tiny_source import CAMERA, TinySource, wall_pose
 from fieldkit.frames import Pose
 from fieldkit.store import write_camera, write_tum
 from fieldkit.tags import draw_tag
+from fieldkit.types import Image
 from sim_bridge.aim import aim
 from sim_bridge.rendering import render
 
 # Edge of the black square and of the whole print, whose margin is one cell of eight
 TAG_M = 0.48
 PRINT_M = TAG_M * 10 / 8
+
+
+def view(world_from_cam: Pose) -> Image:
+    """Return the grey image of the room without tags from a place."""
+    seen = render(TinySource()._scene, CAMERA, world_from_cam, samples=4)
+    return np.asarray(cv2.cvtColor(seen.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def write_walk(folder: Path, *, n: int = 16, tags: bool = False) -> Mapping[str, Pose]:

@@ -16,7 +16,7 @@ import numpy as np
 from fieldkit.calibrate import pictures
 from fieldkit.cameras import Camera
 from fieldkit.errors import TagError
-from fieldkit.store import read_camera, read_photos
+from fieldkit.store import calibration_file, read_camera, read_photos
 from fieldkit.tags import TagDetection, detect
 from fieldkit.tags.detectors import find_detector
 from fieldkit.tags.families import FAMILIES
@@ -92,7 +92,7 @@ def list_photos(folder: Path, camera: Path | None) -> list[Photo]:
         listed = [Photo(e.file, folder / e.file, cameras[e.camera], paths[e.camera], e.visit) for e in entries]
     else:
         files = _photo_files(folder)
-        path = camera or folder / "camera.toml"
+        path = camera or calibration_file(folder, "camera")
         if files and not path.is_file():
             raise TagError(
                 f"{path}: no such camera file; expected the calibration of the photos in {folder}",

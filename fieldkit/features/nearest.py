@@ -64,6 +64,63 @@ def nearest(query: Any8OrFloat, stored: Any8OrFloat, group: Ints, *, threads: in
     return Nearest(index, squared + own, other + own)
 
 
+@dataclasses.dataclass(frozen=True)
+class Shelves:
+    """Descriptors on shelves, packed once for `nearest_on_shelves`.
+
+    Shelf i has the panels ``bounds[i]:bounds[i + 1]`` of ``panels`` f32[p, w, 64]; ``squares`` f32[64 p] and ``owner``
+    int32[64 p] are of their descriptors.
+    """
+
+    panels: Floats
+    squares: Floats
+    owner: Ints
+    bounds: NDArray[np.int64]
+
+
+def fill_shelves(stored: Any8OrFloat, group: Ints, shelf: Ints, *, count: int) -> Shelves:
+    """Pack descriptors (m, w) that groups int32[m] own onto ``count`` shelves int32[m]."""
+    width = -(-stored.shape[1] // 4) * 4
+    order = np.argsort(shelf, kind="stable")
+    starts = np.searchsorted(shelf[order], np.arange(count + 1))
+    bounds = np.concatenate([[0], np.cumsum(-(-np.diff(starts) // _PANEL))])
+    panels = np.zeros((bounds[-1], width, _PANEL), dtype=np.float32)
+    squares = np.full(len(panels) * _PANEL, np.inf, dtype=np.float32)
+    owner = np.full(len(squares), -1, dtype=np.int32)
+    for i in range(count):
+        mine, first, last = order[starts[i] : starts[i + 1]], int(bounds[i]), int(bounds[i + 1])
+        _pack(stored[mine], panels[first:last], squares[first * _PANEL : last * _PANEL])
+        owner[first * _PANEL : first * _PANEL + len(mine)] = group[mine]
+    return Shelves(panels, squares, owner, bounds)
+
+
+def nearest_on_shelves(query: Any8OrFloat, shelf: Ints, shelves: Shelves) -> Nearest:
+    """Find per query (n, w) the nearest descriptor on its shelf int32[n]; ``index`` is who owns it, -1 for none."""
+    order = np.argsort(shelf, kind="stable")
+    rows = np.zeros((len(query), shelves.panels.shape[1]), dtype=np.float32)
+    rows[:, : query.shape[1]] = query[order]
+    own = np.zeros(len(rows), dtype=np.float32)
+    _squares(rows, own)
+    starts = np.searchsorted(shelf[order], np.arange(len(shelves.bounds)))
+    owner = np.full(len(rows), -1, dtype=np.int32)
+    squared, other = np.full(len(rows), np.inf, dtype=np.float32), np.full(len(rows), np.inf, dtype=np.float32)
+    _search_shelves(rows, starts, shelves.panels, shelves.squares, shelves.owner, shelves.bounds, owner, squared, other)
+    back = np.argsort(order, kind="stable")
+    return Nearest(owner[back], (squared + own)[back], (other + own)[back])
+
+
+def two_nearest(rows: Floats, centres: Floats) -> Ints:
+    """Return int32[2, n]: which of the centres f32[k, w] are nearest to rows f32[n, w], and second nearest.
+
+    The same one twice where there is one centre only.
+    """
+    found = np.zeros((2, len(rows)), dtype=np.int32)
+    squares = np.zeros(len(centres), dtype=np.float32)
+    _squares(np.ascontiguousarray(centres), squares)
+    _two_nearest(np.ascontiguousarray(rows), np.ascontiguousarray(centres.T), squares, found)
+    return found
+
+
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def _pack(stored, panels, squares):  # type: ignore[no-untyped-def]
     for j in range(len(stored)):
@@ -133,3 +190,43 @@ def _search(rows, panels, squares, owner, index, squared, other):  # type: ignor
                         else:
                             second = here
                 squared[row], other[row], index[row], owners[row] = first, second, best, mine
+
+
+@numba.njit(cache=True, nogil=True)
+def _search_shelves(rows, starts, panels, squares, owners, bounds, owner, squared, other):  # type: ignore[no-untyped-def]
+    index = np.zeros(len(rows), dtype=np.int32)
+    for s in range(len(bounds) - 1):
+        a, b, first, last = starts[s], starts[s + 1], bounds[s], bounds[s + 1]
+        if a == b or first == last:
+            continue
+        mine = owners[first * _PANEL : last * _PANEL]
+        _search(
+            rows[a:b],
+            panels[first:last],
+            squares[first * _PANEL : last * _PANEL],
+            mine,
+            index[a:b],
+            squared[a:b],
+            other[a:b],
+        )
+        for i in range(a, b):
+            owner[i] = mine[index[i]]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _two_nearest(rows, columns, squares, found):  # type: ignore[no-untyped-def]
+    sums = np.empty(columns.shape[1], dtype=np.float32)
+    for i in range(len(rows)):
+        sums[:] = 0.0
+        for k in range(rows.shape[1]):
+            value, column = rows[i, k], columns[k]
+            for j in range(len(sums)):
+                sums[j] += value * column[j]
+        first = second = np.float32(np.inf)
+        for j in range(len(sums)):
+            here = squares[j] - np.float32(2.0) * sums[j]
+            if here < first:
+                found[1, i], second = found[0, i], first
+                found[0, i], first = j, here
+            elif here < second:
+                found[1, i], second = j, here

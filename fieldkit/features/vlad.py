@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.features import Descriptors
-from fieldkit.features.nearest import Ints, nearest
+from fieldkit.features.nearest import Ints, two_nearest
 
 Floats = NDArray[np.float32]
 
@@ -39,16 +39,17 @@ def train_vocabulary(descriptors: Descriptors, *, seed: int, size: int = 64, max
     return Vocabulary(centres)
 
 
-def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors) -> Floats:
+def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors, *, words: Ints | None = None) -> Floats:
     """Return the unit VLAD vector f32[k * w] of one image: residuals per centre, each normalised, square-rooted.
 
-    An image without descriptors gives zeros, which is equally far from every image.
+    ``words`` int32[n] are the descriptors' nearest centres where they are known. An image without descriptors gives
+    zeros, which is equally far from every image.
     """
     size, width = vocabulary.centres.shape
     result = np.zeros((size, width), dtype=np.float32)
     if len(descriptors):
         points = _unit(descriptors)
-        nearest = _assign(points, vocabulary.centres)
+        nearest = _assign(points, vocabulary.centres) if words is None else words
         order = np.argsort(nearest, kind="stable")
         words, starts = np.unique(nearest[order], return_index=True)
         residuals = points[order] - vocabulary.centres[nearest[order]]
@@ -59,10 +60,15 @@ def global_descriptor(vocabulary: Vocabulary, descriptors: Descriptors) -> Float
     return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12), dtype=np.float32)
 
 
+def two_words(vocabulary: Vocabulary, descriptors: Descriptors) -> Ints:
+    """Return int32[2, n]: the nearest and the second nearest word (row of the vocabulary) of each descriptor (n, w)."""
+    return two_nearest(_unit(descriptors), vocabulary.centres)
+
+
 def _unit(descriptors: Descriptors) -> Floats:
     values = np.asarray(descriptors, dtype=np.float32)
     return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12), dtype=np.float32)
 
 
 def _assign(points: Floats, centres: Floats) -> Ints:
-    return nearest(points, centres, np.arange(len(centres), dtype=np.int32)).index
+    return np.asarray(two_nearest(points, centres)[0])

@@ -82,7 +82,8 @@ def linearise(  # type: ignore[no-untyped-def]
         rows[n, 1, 6] = y / z * fy - pixels[n, 1]
         first = math.sqrt(spread[0, 0])
         below = spread[1, 0] / first
-        second = math.sqrt(spread[1, 1] - below * below)
+        # Of a landmark with one long axis the difference is lost in rounding; it is not below the pixel's own noise.
+        second = math.sqrt(max(spread[1, 1] - below * below, variance[n]))
         for k in range(7):
             rows[n, 0, k] /= first
             rows[n, 1, k] = (rows[n, 1, k] - below * rows[n, 0, k]) / second

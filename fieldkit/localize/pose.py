@@ -254,12 +254,12 @@ def _ransac(
         options.ransac.max_error = max_error_px
         options.ransac.random_seed = seed
         options.ransac.num_threads = 1
-        found = pycolmap.estimate_and_refine_absolute_pose(cameras[0].pixels, cameras[0].xyz, models[0], options)
+        found = pycolmap.estimate_absolute_pose(cameras[0].pixels, cameras[0].xyz, models[0], options)
     else:
         ransac = pycolmap.RANSACOptions()
         ransac.max_error, ransac.random_seed, ransac.num_threads = max_error_px, seed, 1
         cams_from_rig = [pycolmap.Rigid3d(_from_rig(c).inv().as_matrix()[:3]) for c in cameras]
-        found = pycolmap.estimate_and_refine_generalized_absolute_pose(
+        found = pycolmap.estimate_generalized_absolute_pose(
             np.concatenate([c.pixels for c in cameras]),
             np.concatenate([c.xyz for c in cameras]),
             np.repeat(np.arange(len(cameras)), [len(c.xyz) for c in cameras]),

@@ -1,15 +1,15 @@
 """Maps: structure from motion, metric alignment, landmarks and surface, from images to a map folder and back."""
 
-from fieldkit.maps.build import build_map
+from fieldkit.maps.build import MapReport, build_map
 from fieldkit.maps.compact import compact_map
-from fieldkit.maps.exporting import Exported, export_map
+from fieldkit.maps.exchange.exporting import Exported, export_map
+from fieldkit.maps.exchange.import_frame import FrameOptions
+from fieldkit.maps.exchange.importing import ImportOptions, import_map
+from fieldkit.maps.exchange.meshes import ForeignMesh
 from fieldkit.maps.gauge import Gauge, fit_gauge
-from fieldkit.maps.import_frame import FrameOptions
-from fieldkit.maps.importing import ImportOptions, import_map
 from fieldkit.maps.io import content_digest, load_map, map_info
 from fieldkit.maps.landmarks import LandmarkRules
-from fieldkit.maps.meshes import ForeignMesh
-from fieldkit.maps.options import MapOptions, MapReport
+from fieldkit.maps.options import MapOptions
 from fieldkit.warp import MapWarp, map_warp
 
 __all__ = [

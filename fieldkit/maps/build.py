@@ -15,14 +15,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+import fieldkit
 from fieldkit.errors import MapError, SurfaceError
 from fieldkit.features import Extractor, Features, feature_name, open_extractor
 from fieldkit.features.appearance import Appearance, open_appearance
 from fieldkit.features.matchers import PairMatcher, open_matcher
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity
-from fieldkit.maps.checking import check_images, content
-from fieldkit.maps.framing import look_for_tags, refuse_unscaled
 from fieldkit.maps.io import (
     AlignmentEntry,
     MapFile,
@@ -32,17 +30,20 @@ from fieldkit.maps.io import (
     write_map_file,
 )
 from fieldkit.maps.landmarks import LandmarkRules, good_landmarks, model_arrays
-from fieldkit.maps.metric import depth_views
-from fieldkit.maps.options import MapOptions, MapReport, Progress
-from fieldkit.maps.pairs import Pair, choose_pairs, match_pairs
-from fieldkit.maps.placing import Matched, place_images
-from fieldkit.maps.plausible import plausible_matches
+from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.metric.choosing import look_for_tags, refuse_unscaled
+from fieldkit.maps.metric.depth import depth_views
+from fieldkit.maps.options import MapOptions, Progress
 from fieldkit.maps.record import write_record
-from fieldkit.maps.sfm import threads
-from fieldkit.maps.source import MapSource, SourceImage, read_depth, read_image, without_poses
+from fieldkit.maps.sources.checking import check_images, content
+from fieldkit.maps.sources.source import MapSource, SourceImage, read_depth, read_image, without_poses
+from fieldkit.maps.sources.streamrecorder import open_source
 from fieldkit.maps.stages import Stages, resumed, shares
-from fieldkit.maps.strays import strays
-from fieldkit.maps.streamrecorder import open_source
+from fieldkit.maps.structure.pairs import Pair, choose_pairs, match_pairs
+from fieldkit.maps.structure.placing import Matched, place_images
+from fieldkit.maps.structure.plausible import plausible_matches
+from fieldkit.maps.structure.sfm import threads
+from fieldkit.maps.structure.strays import strays
 from fieldkit.maps.whole import FILE, write_global
 from fieldkit.store import atomic_folder, digest, library_versions
 from fieldkit.store.files import refuse_existing
@@ -53,8 +54,23 @@ from fieldkit.types import Surface
 _SHARE = 500
 
 
+@dataclasses.dataclass(frozen=True)
+class MapReport:
+    """What became of a SOURCE: counts, alignment, seconds per step, and what a user should know."""
+
+    path: str
+    digest: str
+    n_images: int
+    n_registered: int
+    n_landmarks: int
+    alignment: Alignment
+    has_surface: bool
+    seconds: Mapping[str, float]
+    warnings: tuple[str, ...]
+
+
 def build_map(
-    source: Path,
+    source: Path | MapSource,
     out: Path,
     *,
     feature: str = "sift",
@@ -76,7 +92,7 @@ def build_map(
     tell: Progress = progress or (lambda step, done, total: None)
     feature = feature_name(feature)
     refuse_existing(out, force=force, marker="map.toml", kind="folder")
-    walk = open_source(Path(source))
+    walk = source if isinstance(source, MapSource) else open_source(Path(source))
     refuse_unscaled(walk, options)
     check_images(walk)
     extractor = open_extractor(
@@ -86,7 +102,7 @@ def build_map(
     appearance = None if options.retrieval == "own" else open_appearance(options.retrieval, weights=options.weights)
     walk = without_poses(walk) if options.poses == "none" else walk
     versions = library_versions()
-    key = digest(feature, repr(options), repr((seed, versions)), *content(walk))
+    key = digest(feature, repr(options), repr((seed, versions)), *_program(), *content(walk))
     with resumed(out, key) as stages:
         with stages.timed("tags") if options.tag_sizes_m else contextlib.nullcontext():
             tags = look_for_tags(walk, options, progress=tell)
@@ -113,6 +129,11 @@ def build_map(
             if options.keep_record:
                 write_record(folder, dict(stages.seconds), versions=versions, options=repr(options), told=told)
     return MapReport(str(out), made, *counts, alignment, surface is not None, dict(stages.seconds), told)
+
+
+def _program() -> list[Path]:
+    """Return fieldkit's own files: its version alone does not tell one state of a checkout from the next."""
+    return sorted(Path(fieldkit.__file__).parent.rglob("*.py"))
 
 
 def _extract_all(

@@ -19,7 +19,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError
 from fieldkit.frames import Pose
 from fieldkit.maps.landmarks import Model
-from fieldkit.maps.sfm import quiet_colmap
+from fieldkit.maps.quiet import quiet_colmap
 from fieldkit.observations import reprojection_errors
 
 Array = NDArray[np.float64]

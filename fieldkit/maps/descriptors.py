@@ -17,8 +17,9 @@ from fieldkit.errors import MapError
 from fieldkit.maps.landmarks import Model
 from fieldkit.observations import observations_of
 
-# Room for 1.3 8-bit SIFT descriptors of each of a million landmarks: all of such a map then fits into a gigabyte
-MAX_BYTES = 160 << 20
+# Room for one 8-bit SIFT descriptor of each of a million landmarks: all of such a map then fits into a gigabyte.
+# Landmarks of a map of 350,000 keep the three with which the localizer matches.
+MAX_BYTES = 128 << 20
 _MAX_RANK = 255
 # glibc, malloc.h
 _M_MMAP_THRESHOLD = -3

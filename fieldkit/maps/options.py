@@ -9,13 +9,36 @@ from typing import Literal
 
 from fieldkit.errors import MapError
 from fieldkit.features.matchers import MatcherName
-from fieldkit.maps.align import Alignment
 from fieldkit.maps.io import positive
 from fieldkit.maps.landmarks import LandmarkRules
-from fieldkit.maps.plausible import SlamRules
 from fieldkit.tags.families import find_family
 
 Progress = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class SlamRules:
+    """How far SLAM's relative poses are trusted: generously, they only have to tell one desk from the next.
+
+    ``rotation_deg`` and ``position_m`` are the errors allowed between two images, the latter growing by
+    ``drift_per_m`` of the way walked in between; points lie ``nearest_m`` to ``farthest_m`` away, and nothing looks
+    the same from directions more than ``widest_deg`` apart: opposite shelves do. Poses that fit less than
+    ``least_share`` of all matches are wrong themselves and rule out nothing.
+    Where a map folds nevertheless, pairs of images lose all their matches when the relative pose that these alone give
+    is turned by more than ``pair_rotation_deg`` against SLAM's, or, for images ``pair_baseline_m`` apart, points
+    ``pair_direction_deg`` elsewhere.
+    """
+
+    rotation_deg: float = 3.0
+    position_m: float = 0.1
+    drift_per_m: float = 0.005
+    nearest_m: float = 0.2
+    farthest_m: float = 15.0
+    widest_deg: float = 60.0
+    least_share: float = 0.5
+    pair_rotation_deg: float = 8.0
+    pair_direction_deg: float = 25.0
+    pair_baseline_m: float = 0.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,18 +99,3 @@ class MapOptions:
             raise MapError(
                 "scale by SLAM, but its poses are not to be read", hint="choose --poses slam or another scale"
             )
-
-
-@dataclasses.dataclass(frozen=True)
-class MapReport:
-    """What became of a SOURCE: counts, alignment, seconds per step, and what a user should know."""
-
-    path: str
-    digest: str
-    n_images: int
-    n_registered: int
-    n_landmarks: int
-    alignment: Alignment
-    has_surface: bool
-    seconds: Mapping[str, float]
-    warnings: tuple[str, ...]

@@ -28,10 +28,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fieldkit.frames import Pose, exp
 from fieldkit.maps import MapOptions, build_map, fit_gauge, load_map
-from fieldkit.maps.align import Alignment, umeyama
-from fieldkit.maps.framing import find_frame
-from fieldkit.maps.source import MapSource, read_source, without_poses
-from fieldkit.maps.tagged import find_tags
+from fieldkit.maps.metric.align import Alignment, umeyama
+from fieldkit.maps.metric.choosing import find_frame
+from fieldkit.maps.metric.tagged import find_tags
+from fieldkit.maps.sources.source import MapSource, read_source, without_poses
 from fieldkit.store import read_tum, write_rig, write_tum
 from fieldkit.tags import TagDetection
 from sim_bridge.mapping import mapper

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
-from fieldkit.maps.metric import depth_views
-from fieldkit.maps.source import MapSource, read_depth, read_image
+from fieldkit.maps.metric.depth import depth_views
+from fieldkit.maps.sources.source import MapSource, read_depth, read_image
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from fieldkit.features import FEATURES
 from fieldkit.maps.colmap import read_model, write_model
 from fieldkit.maps.io import read_map_file, refuse_changed
 from fieldkit.maps.landmarks import Model
-from fieldkit.maps.sfm import quiet_colmap
+from fieldkit.maps.quiet import quiet_colmap
 from fieldkit.store import atomic_folder, refuse_existing, write_tum
 
 Format = Literal["colmap", "hloc", "tum"]

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.source import DepthFrame, MapSource, SourceImage, read_source
+from fieldkit.maps.sources.source import DepthFrame, MapSource, SourceImage, read_source
 from fieldkit.store.files import read_text
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from fieldkit.errors import MapError
 from fieldkit.features import FEATURES, feature_kind, open_extractor, read_image
 from fieldkit.maps.landmarks import Model
-from fieldkit.maps.sfm import threads
+from fieldkit.maps.structure.sfm import threads
 from fieldkit.observations import observations_of
 
 Pixels = NDArray[np.float32]

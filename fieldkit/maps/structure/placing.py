@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from fieldkit.errors import MapError
 from fieldkit.features import Features
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment
-from fieldkit.maps.framing import find_frame
-from fieldkit.maps.known import match_share, triangulate
-from fieldkit.maps.options import MapOptions, Progress
-from fieldkit.maps.pairs import Pair
-from fieldkit.maps.plausible import SlamRules, plausible_pairs
-from fieldkit.maps.sfm import quiet_colmap, reconstruct, relative_poses, threads, write_verified
-from fieldkit.maps.source import MapSource
+from fieldkit.maps.metric.align import Alignment
+from fieldkit.maps.metric.choosing import find_frame
+from fieldkit.maps.options import MapOptions, Progress, SlamRules
+from fieldkit.maps.quiet import quiet_colmap
+from fieldkit.maps.sources.source import MapSource
 from fieldkit.maps.stages import Stages
-from fieldkit.maps.strays import folded
+from fieldkit.maps.structure.known import match_share, triangulate
+from fieldkit.maps.structure.pairs import Pair
+from fieldkit.maps.structure.plausible import plausible_pairs
+from fieldkit.maps.structure.sfm import reconstruct, relative_poses, threads, write_verified
+from fieldkit.maps.structure.strays import folded
 from fieldkit.tags import TagDetection
 
 # A few misplaced images are left out; of more than this share the rest is bent too, and SfM starts again.

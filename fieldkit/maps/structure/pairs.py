@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fieldkit.features import Features
 from fieldkit.features.matchers import PairMatcher
 from fieldkit.features.vlad import global_descriptor, train_vocabulary
-from fieldkit.maps.source import SourceImage
+from fieldkit.maps.sources.source import SourceImage
 
 Pair = tuple[int, int]
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose, mean_pose
-from fieldkit.maps.align import Alignment, Similarity
 from fieldkit.maps.landmarks import Model
-from fieldkit.maps.source import DepthFrame, MapSource
+from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.sources.source import DepthFrame, MapSource
 
 Array = NDArray[np.float64]
 ReadDepth = Callable[[DepthFrame], NDArray[np.uint16]]

@@ -14,7 +14,7 @@ from fieldkit import features
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError, SurfaceError
 from fieldkit.frames import Pose
-from fieldkit.maps.stamps import NamedPoses
+from fieldkit.maps.sources.stamps import NamedPoses
 from fieldkit.store import calibration_file, read_camera, read_rig, read_tum
 from fieldkit.types import Image
 

@@ -12,15 +12,15 @@ import pycolmap
 
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity, Verdict, align_to_slam
-from fieldkit.maps.known import known_alignment
 from fieldkit.maps.landmarks import Model, model_arrays
-from fieldkit.maps.metric import DepthScale, depth_scale, rescaled, with_depth_scale
+from fieldkit.maps.metric.align import Alignment, Similarity, Verdict, align_to_slam
+from fieldkit.maps.metric.depth import DepthScale, depth_scale, rescaled, with_depth_scale
+from fieldkit.maps.metric.given import known_alignment
+from fieldkit.maps.metric.tagged import MIN_IMAGES, TagScale, find_tags, tag_scale
+from fieldkit.maps.metric.upright import Upright, find_upright, up_rotation
 from fieldkit.maps.options import MapOptions, Progress
-from fieldkit.maps.order import walk_order
-from fieldkit.maps.source import MIN_POSES, MapSource, poses_path, read_depth
-from fieldkit.maps.tagged import MIN_IMAGES, TagScale, find_tags, tag_scale
-from fieldkit.maps.upright import Upright, find_upright, up_rotation
+from fieldkit.maps.sources.order import walk_order
+from fieldkit.maps.sources.source import MIN_POSES, MapSource, poses_path, read_depth
 from fieldkit.tags import TagDetection
 
 Told = tuple[Alignment, list[str]]

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Alignment, Similarity
-from fieldkit.maps.framing import find_frame, look_for_tags
 from fieldkit.maps.landmarks import Model
+from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.metric.choosing import find_frame, look_for_tags
 from fieldkit.maps.options import MapOptions, Progress
-from fieldkit.maps.source import MIN_POSES, DepthFrame, MapSource, SourceImage
-from fieldkit.maps.stamps import match_names
+from fieldkit.maps.sources.source import MIN_POSES, DepthFrame, MapSource, SourceImage
+from fieldkit.maps.sources.stamps import match_names
 from fieldkit.store import read_camera, read_tum
 
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -97,11 +97,7 @@ def _walk(folder: Path, model: Model, images: Path | None, options: FrameOptions
                 f"least {MIN_POSES}",
                 hint="give each pose the name of its image, or the stamp by which the image is named",
             )
-    found = []
-    for name, camera in zip(model.image_names, model.image_cameras, strict=True):
-        path = PurePosixPath(name)
-        file = Path(name) if images is None else images / name
-        found.append(SourceImage(name, file, camera, path.parent.as_posix(), path.stem, poses.get(name)))
+    found = _images(model, images, poses)
     if options.depth is None:
         return MapSource(folder, tuple(found), None, ())
     if options.depth_camera is None:
@@ -116,3 +112,18 @@ def _walk(folder: Path, model: Model, images: Path | None, options: FrameOptions
             f"{options.depth}: no depth image of the model's images; expected <name>.png", hint="check --depth"
         )
     return MapSource(folder, tuple(found), read_camera(options.depth_camera), tuple(frames))
+
+
+def posed_walk(folder: Path, model: Model, images: Path) -> MapSource:
+    """Return the model's images with its own poses, as if a map were to be built from them."""
+    poses = dict(zip(model.image_names, model.map_from_image, strict=True))
+    return MapSource(folder, tuple(_images(model, images, poses)), None, ())
+
+
+def _images(model: Model, images: Path | None, poses: Mapping[str, Pose]) -> list[SourceImage]:
+    found = []
+    for name, camera in zip(model.image_names, model.image_cameras, strict=True):
+        path = PurePosixPath(name)
+        file = Path(name) if images is None else images / name
+        found.append(SourceImage(name, file, camera, path.parent.as_posix(), path.stem, poses.get(name)))
+    return found

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.frames import Pose
-from fieldkit.maps.order import walk_order
-from fieldkit.maps.source import SourceImage
+from fieldkit.maps.sources.order import walk_order
+from fieldkit.maps.sources.source import SourceImage
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from fieldkit.cameras import Camera
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.headers import read_header
-from fieldkit.maps.source import MapSource
+from fieldkit.maps.sources.headers import read_header
+from fieldkit.maps.sources.source import MapSource
 
 
 def check_images(walk: MapSource) -> None:

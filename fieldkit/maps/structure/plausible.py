@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,36 +9,12 @@ from numpy.typing import NDArray
 
 from fieldkit.features import Features
 from fieldkit.frames import Pose
-from fieldkit.maps.order import walk_order
-from fieldkit.maps.pairs import Pair
-from fieldkit.maps.source import SourceImage
+from fieldkit.maps.options import SlamRules
+from fieldkit.maps.sources.order import walk_order
+from fieldkit.maps.sources.source import SourceImage
+from fieldkit.maps.structure.pairs import Pair
 
 Array = NDArray[np.float64]
-
-
-@dataclasses.dataclass(frozen=True)
-class SlamRules:
-    """How far SLAM's relative poses are trusted: generously, they only have to tell one desk from the next.
-
-    ``rotation_deg`` and ``position_m`` are the errors allowed between two images, the latter growing by
-    ``drift_per_m`` of the way walked in between; points lie ``nearest_m`` to ``farthest_m`` away, and nothing looks
-    the same from directions more than ``widest_deg`` apart: opposite shelves do. Poses that fit less than
-    ``least_share`` of all matches are wrong themselves and rule out nothing.
-    Where a map folds nevertheless, pairs of images lose all their matches when the relative pose that these alone give
-    is turned by more than ``pair_rotation_deg`` against SLAM's, or, for images ``pair_baseline_m`` apart, points
-    ``pair_direction_deg`` elsewhere.
-    """
-
-    rotation_deg: float = 3.0
-    position_m: float = 0.1
-    drift_per_m: float = 0.005
-    nearest_m: float = 0.2
-    farthest_m: float = 15.0
-    widest_deg: float = 60.0
-    least_share: float = 0.5
-    pair_rotation_deg: float = 8.0
-    pair_direction_deg: float = 25.0
-    pair_baseline_m: float = 0.8
 
 
 def plausible_matches(

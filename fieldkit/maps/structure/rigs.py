@@ -9,7 +9,7 @@ import pycolmap
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
 from fieldkit.maps.landmarks import colmap_camera
-from fieldkit.maps.source import SourceImage
+from fieldkit.maps.sources.source import SourceImage
 
 RIG_ID = 1
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from fieldkit.maps.source import SourceImage
+from fieldkit.maps.sources.source import SourceImage
 
 
 def walk_order(images: Sequence[SourceImage], members: Iterable[int]) -> list[int]:

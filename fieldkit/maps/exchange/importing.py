@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from fieldkit.errors import MapError
 from fieldkit.features import Features, feature_name
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Similarity
-from fieldkit.maps.build import alignment_entry
+from fieldkit.maps.build import MapReport, alignment_entry, build_map
 from fieldkit.maps.colmap import model_folder, read_model, write_model
-from fieldkit.maps.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
-from fieldkit.maps.import_frame import FrameOptions, metric_alignment
+from fieldkit.maps.exchange.describing import database_descriptors, hloc_descriptors, image_descriptors, refuse_missing
+from fieldkit.maps.exchange.import_frame import FrameOptions, metric_alignment, posed_walk
+from fieldkit.maps.exchange.meshes import ForeignMesh, fit_mesh
 from fieldkit.maps.io import (
     MapFile,
     SurfaceEntry,
@@ -28,8 +28,9 @@ from fieldkit.maps.io import (
     write_map_file,
 )
 from fieldkit.maps.landmarks import LandmarkRules, Model, good_landmarks
-from fieldkit.maps.meshes import ForeignMesh, fit_mesh
-from fieldkit.maps.options import MapReport, Progress
+from fieldkit.maps.metric.align import Similarity
+from fieldkit.maps.options import MapOptions, Progress
+from fieldkit.maps.sources.source import MapSource
 from fieldkit.store import atomic_folder, refuse_existing
 from fieldkit.surface import write_ply
 from fieldkit.types import Surface
@@ -40,6 +41,7 @@ class ImportOptions:
     """Where a model's frame, descriptors and surface come from.
 
     ``features`` is hloc's features.h5, ``database`` COLMAP's; without either descriptors are extracted from the images.
+    ``retriangulate`` keeps cameras and poses alone: landmarks are found anew, by any feature.
     Raises MapError when the scale is not positive or more than one source is given for one thing.
     """
 
@@ -50,6 +52,7 @@ class ImportOptions:
     mesh: ForeignMesh | None = None
     landmarks: LandmarkRules = dataclasses.field(default_factory=LandmarkRules)
     weights: Path | None = None
+    retriangulate: bool = False
 
     def __post_init__(self) -> None:
         frame = self.frame
@@ -61,6 +64,11 @@ class ImportOptions:
         ):
             if None not in given:
                 raise MapError(f"--{first} and --{second} are both given; expected one", hint="leave one of them away")
+        if self.retriangulate and any(v is not None for v in (self.features, self.database, self.mesh)):
+            raise MapError(
+                "--retriangulate finds features of its own; expected neither --features, --database nor --mesh",
+                hint="for a mesh import the new map again: --scale 1 --features NEW.map/features.h5 --mesh MESH",
+            )
 
 
 def import_map(
@@ -89,6 +97,10 @@ def import_map(
     _refuse_useless(folder, found, images, options)
     alignment, warnings = metric_alignment(folder, found, images, options.frame, seed=seed, progress=tell)
     model, n_points = _in_map(found, alignment.map_from_sfm), len(found.xyz)
+    if options.retriangulate:
+        assert images is not None
+        rebuilt = _rebuilt(posed_walk(folder, model, images), out, options, force=force, seed=seed, progress=tell)
+        return dataclasses.replace(rebuilt, warnings=(*warnings, *rebuilt.warnings))
     good = good_landmarks(model, options.landmarks)
     if not good.any():
         rules = options.landmarks
@@ -116,8 +128,17 @@ def import_map(
     return MapReport(str(out), digest, *counts, alignment, surface is not None, seconds, tuple(warnings))
 
 
+def _rebuilt(
+    walk: MapSource, out: Path, options: ImportOptions, *, force: bool, seed: int, progress: Progress
+) -> MapReport:
+    """Find landmarks anew from images whose poses are the model's."""
+    building = MapOptions(poses="known", weights=options.weights, landmarks=options.landmarks)
+    return build_map(walk, out, feature=options.feature, force=force, options=building, seed=seed, progress=progress)
+
+
 def _refuse_useless(folder: Path, model: Model, images: Path | None, options: ImportOptions) -> None:
-    if not model.image_names or not len(model.xyz) or not len(model.observation_landmark):
+    empty = not len(model.xyz) and not options.retriangulate
+    if not model.image_names or empty or (not len(model.observation_landmark) and not options.retriangulate):
         raise MapError(
             f"{folder}: {len(model.image_names)} registered images, {len(model.xyz)} points; expected both",
             hint="a model without points can be triangulated first: `colmap point_triangulator`",

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.cameras import Camera
 from fieldkit.frames import Pose
-from fieldkit.maps.align import Similarity, umeyama
-from fieldkit.maps.source import MapSource, read_image
+from fieldkit.maps.metric.align import Similarity, umeyama
+from fieldkit.maps.sources.source import MapSource, read_image
 from fieldkit.tags import TagDetection, detect, tag_corners
 
 Array = NDArray[np.float64]

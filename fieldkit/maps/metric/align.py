@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from fieldkit.errors import MapError
 from fieldkit.frames import Pose
-from fieldkit.maps.motion import Walks, motion_scale, position_sigma
-from fieldkit.maps.source import MIN_POSES
+from fieldkit.maps.metric.motion import Walks, motion_scale, position_sigma
+from fieldkit.maps.sources.source import MIN_POSES
 
 Array = NDArray[np.float64]
 Verdict = Literal["pass", "warn", "fail"]

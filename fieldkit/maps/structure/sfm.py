@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from fieldkit.errors import MapError
 from fieldkit.features import Features
 from fieldkit.frames import Pose
-from fieldkit.maps.pairs import Pair
-from fieldkit.maps.rigs import write_cameras
-from fieldkit.maps.source import SourceImage
+from fieldkit.maps.quiet import quiet_colmap
+from fieldkit.maps.sources.source import SourceImage
+from fieldkit.maps.structure.pairs import Pair
+from fieldkit.maps.structure.rigs import write_cameras
 
 # Below this number of verified matches a pair is not used (COLMAP's own bound).
 _MIN_MATCHES = 15
@@ -25,17 +26,6 @@ _MIN_MATCHES = 15
 _SHARE = 500
 
 Progress = Callable[[str, int, int], None]
-
-
-@contextlib.contextmanager
-def quiet_colmap() -> Iterator[None]:
-    """Silence COLMAP's log below errors while it works, and put the old level back."""
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value + 1
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
 
 
 def write_database(
