@@ -62,11 +62,11 @@ def drifting(poses: list[Pose], *, rng: np.random.Generator) -> list[Pose]:
 
 
 def write_source(data: Path, out: Path, poses: dict[int, Pose]) -> None:
-    """Write the image folder from which `fieldkit map build` makes the map."""
+    """Write the image folder from which `fieldkit map build` makes the map, with the frames that have a pose here."""
     (out / "images").mkdir(parents=True)
     (out / "depth").mkdir()
     rows = []
-    for number in (n for n in poses if (n // BLOCK) % 2 == 0):
+    for number in poses:
         name = f"{number:06d}"
         shutil.copy(data / "frames" / f"frame-{name}.color.jpg", out / "images" / f"{name}.jpg")
         depth = cv2.imread(str(data / "frames" / f"frame-{name}.depth.png"), cv2.IMREAD_UNCHANGED)
@@ -118,7 +118,7 @@ def main(data: tyro.conf.Positional[Path], *, out: Path, force: bool = False) ->
     """
     poses = read_poses(data)
     with store.atomic_folder(out, force=force) as work:
-        write_source(data, work / "source", poses)
+        write_source(data, work / "source", {n: p for n, p in poses.items() if (n // BLOCK) % 2 == 0})
         write_recording(data, work / "recording.mcap", poses)
 
 
