@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fieldkit.errors import FeatureError
-from fieldkit.features import FEATURES, extract, feature_name, read_grey, read_image
+from fieldkit.features import FEATURES, extract, feature_name, read_grey, read_image, to_grey
 from fieldkit.features.matching import match_groups, match_pair
 from fieldkit.features.sift import root_sift
 from fieldkit.features.vlad import global_descriptor, train_vocabulary
@@ -91,6 +91,18 @@ def test_an_unknown_feature_is_named_with_a_suggestion() -> None:
 def test_an_array_that_is_no_image_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(FeatureError, match="expected uint8"):
         extract(np.zeros(shape, dtype=np.uint8))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_file_and_the_same_image_in_a_recording_have_the_same_grey(
+    tmp_path: Path, rng: np.random.Generator, suffix: str
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    assert cv2.imwrite(str(path), rng.integers(0, 256, (40, 60, 3), dtype=np.uint8))
+    stored = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(read_grey(path), to_grey(stored[:, :, ::-1]))
+    assert cv2.imwrite(str(path), rng.integers(0, 256, (40, 60), dtype=np.uint8))
+    np.testing.assert_array_equal(read_grey(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
 
 
 def test_a_missing_or_damaged_image_file_is_named(tmp_path: Path) -> None:

@@ -111,6 +111,13 @@ def test_an_imported_model_is_triangulated_anew_by_another_feature(
     assert report.n_landmarks == len(scene_map.xyz) > 100
     for name, pose in zip(scene_map.image_names, scene_map.map_from_image, strict=True):
         assert max(pose_error(pose, true[name])) < 1e-6
+    halved = [(n, Pose.from_components(0.5 * p.translation, p.rotation)) for n, p in true.items()]
+    halved = [(n, p if i % 2 else true[n]) for i, (n, p) in enumerate(halved)]
+    write_tum(tmp_path / "bent.txt", halved)
+    bent = ImportOptions("akaze", FrameOptions(poses=tmp_path / "bent.txt"), retriangulate=True)
+    import_map(tmp_path / "m", tmp_path / "bent", images=source / "images", options=bent)
+    stated = map_info(tmp_path / "bent")["alignment"]
+    assert (stated["source"], stated["verdict"] != "pass", stated["match_share"] > 0.8) == ("slam", True, True)
 
 
 def test_the_frames_of_a_rig_stay_where_their_known_poses_are(

@@ -40,22 +40,21 @@ def _refuse_other(image: Image) -> None:
 def read_grey(path: Path) -> Image:
     """Read an image file as uint8[h, w], as stored: a camera's calibration knows nothing of EXIF turns.
 
-    Raises FeatureError when the file is missing or no readable image.
+    Colours become grey as `to_grey` makes them, so that a file and the same image in a recording are equal. Raises
+    FeatureError when the file is missing or no readable image.
     """
-    return _read(path, cv2.IMREAD_GRAYSCALE)
+    return to_grey(read_image(path, colour=True))
 
 
 def read_image(path: Path, *, colour: bool) -> Image:
     """Read an image file as `read_grey` does, or with ``colour`` as RGB uint8[h, w, 3], grey files repeated."""
-    if not colour:
-        return read_grey(path)
-    return np.ascontiguousarray(_read(path, cv2.IMREAD_COLOR)[:, :, ::-1])
+    return np.ascontiguousarray(_read(path)[:, :, ::-1]) if colour else read_grey(path)
 
 
-def _read(path: Path, mode: int) -> Image:
+def _read(path: Path) -> Image:
     if not Path(path).is_file():
         raise FeatureError(f"{path}: no such file; expected an image", hint="check the path")
-    image = cv2.imread(str(path), mode | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise FeatureError(f"{path}: cannot be read as an image; expected JPEG or PNG", hint="check or remove the file")
     return np.asarray(image, dtype=np.uint8)

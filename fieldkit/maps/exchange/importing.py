@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,14 +25,17 @@ from fieldkit.maps.io import (
     SurfaceEntry,
     content_digest,
     positive,
+    read_map_file,
     write_features,
     write_map_file,
 )
 from fieldkit.maps.landmarks import LandmarkRules, Model, good_landmarks
-from fieldkit.maps.metric.align import Similarity
+from fieldkit.maps.metric.align import Alignment, Similarity
+from fieldkit.maps.metric.choosing import worst
 from fieldkit.maps.options import MapOptions, Progress
+from fieldkit.maps.record import write_record
 from fieldkit.maps.sources.source import MapSource
-from fieldkit.store import atomic_folder, refuse_existing
+from fieldkit.store import atomic_folder, library_versions, refuse_existing
 from fieldkit.surface import write_ply
 from fieldkit.types import Surface
 
@@ -100,7 +104,7 @@ def import_map(
     if options.retriangulate:
         assert images is not None
         rebuilt = _rebuilt(posed_walk(folder, model, images), out, options, force=force, seed=seed, progress=tell)
-        return dataclasses.replace(rebuilt, warnings=(*warnings, *rebuilt.warnings))
+        return _judged(rebuilt, alignment, warnings)
     good = good_landmarks(model, options.landmarks)
     if not good.any():
         rules = options.landmarks
@@ -124,6 +128,7 @@ def import_map(
         write_map_file(
             work, MapFile(1, digest, options.feature, *counts, alignment_entry(alignment), _surface_entry(surface))
         )
+        write_record(work, seconds, versions=library_versions(), options=repr(options), told=warnings)
     seconds["write"] = time.perf_counter() - start
     return MapReport(str(out), digest, *counts, alignment, surface is not None, seconds, tuple(warnings))
 
@@ -134,6 +139,22 @@ def _rebuilt(
     """Find landmarks anew from images whose poses are the model's."""
     building = MapOptions(poses="known", weights=options.weights, landmarks=options.landmarks)
     return build_map(walk, out, feature=options.feature, force=force, options=building, seed=seed, progress=progress)
+
+
+def _judged(rebuilt: MapReport, framed: Alignment, warnings: list[str]) -> MapReport:
+    """Say in the map that its poses are as good as what gave the model its frame, and no better than they fit.
+
+    map.toml is not part of what the digest covers.
+    """
+    alignment = dataclasses.replace(
+        framed,
+        verdict=worst(framed.verdict, rebuilt.alignment.verdict),
+        reprojection_px=rebuilt.alignment.reprojection_px,
+        match_share=rebuilt.alignment.match_share,
+    )
+    path = Path(rebuilt.path)
+    write_map_file(path, msgspec.structs.replace(read_map_file(path), alignment=alignment_entry(alignment)))
+    return dataclasses.replace(rebuilt, alignment=alignment, warnings=(*warnings, *rebuilt.warnings))
 
 
 def _refuse_useless(folder: Path, model: Model, images: Path | None, options: ImportOptions) -> None:

@@ -160,7 +160,7 @@ def _scaled_by_tags(
             "the tags are believed"
         )
         scaled = doubted(scaled)
-    verdict = _worst(scaled.verdict, _scale_verdict(tags.sigma, tags.apart))
+    verdict = worst(scaled.verdict, _scale_verdict(tags.sigma, tags.apart))
     return dataclasses.replace(scaled, source="tags", scale_sigma=tags.sigma, verdict=verdict), told
 
 
@@ -189,7 +189,7 @@ def _by_images(
     if tags is not None:
         scaled = dataclasses.replace(unit, scale=tags.scale, translation=tags.scale * unit.translation)
         numbers = tags.n_used, tags.n_total, tags.rms_m, tags.p95_m
-        verdict = _worst(_scale_verdict(tags.sigma, tags.apart), _gravity_verdict(up))
+        verdict = worst(_scale_verdict(tags.sigma, tags.apart), _gravity_verdict(up))
         alignment = Alignment(scaled, "tags", *numbers, up.sigma_deg, 0.0, verdict, up.source, tags.sigma)
         return alignment, told + _tag_doubts(tags)
     found = None
@@ -204,7 +204,7 @@ def _by_images(
             break
     if found is None:
         raise _too_little_depth(walk) if walk.depth_camera else _no_tags(walk)
-    verdict = _worst(_scale_verdict(found.sigma, 0.0), _gravity_verdict(up))
+    verdict = worst(_scale_verdict(found.sigma, 0.0), _gravity_verdict(up))
     numbers = found.n_used, found.n, found.rms_m, found.p95_m
     return Alignment(unit, "depth", *numbers, up.sigma_deg, 0.0, verdict, up.source, found.sigma), told
 
@@ -263,6 +263,7 @@ def _gravity_verdict(up: Upright) -> Verdict:
     return "pass" if up.sigma_deg < _PASS_DEG else "warn" if up.sigma_deg < _WARN_DEG else "fail"
 
 
-def _worst(*verdicts: Verdict) -> Verdict:
+def worst(*verdicts: Verdict) -> Verdict:
+    """Return the worst of verdicts."""
     order: Sequence[Verdict] = ("pass", "warn", "fail")
     return max(verdicts, key=order.index)
