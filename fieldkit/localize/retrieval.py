@@ -51,7 +51,7 @@ def build_index(scene_map: SceneMap, *, seed: int) -> Index:
 
 def _voters(scene_map: SceneMap, vocabulary: Vocabulary) -> tuple[Shelves, Ints, NDArray[np.int64]]:
     landmark, first = np.unique(scene_map.descriptor_landmark, return_index=True)
-    word = two_words(vocabulary, scene_map.descriptors[first])[0]
+    word = np.concatenate([two_words(vocabulary, scene_map.descriptors[part])[0] for part in _parts(first)])
     n_seen = np.bincount(scene_map.observation_landmark, minlength=len(scene_map.xyz))
     order = np.lexsort((-n_seen[landmark], word))
     rank = np.arange(len(order)) - np.searchsorted(word[order], word[order])
@@ -65,6 +65,11 @@ def _voters(scene_map: SceneMap, vocabulary: Vocabulary) -> tuple[Shelves, Ints,
     cast = cast[np.argsort(scene_map.observation_landmark[cast], kind="stable")]
     starts = np.searchsorted(scene_map.observation_landmark[cast], np.arange(len(scene_map.xyz) + 1))
     return shelves, scene_map.observation_image[cast], starts
+
+
+def _parts(rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return rows int[n] in parts that take little memory."""
+    return np.array_split(rows, -(-len(rows) // 20_000))
 
 
 def image_rows(scene_map: SceneMap) -> tuple[Ints, ...]:
