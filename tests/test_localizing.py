@@ -18,6 +18,7 @@ from fieldkit.bags import open_recording
 from fieldkit.cameras import Camera
 from fieldkit.cli import main
 from fieldkit.errors import FeatureError, LocalizeError
+from fieldkit.features import read_grey
 from fieldkit.features.matching import match_groups
 from fieldkit.frames import Pose, compose_covariance, exp, log, pose_error
 from fieldkit.localize import CameraPrior, Localizer, Query
@@ -298,7 +299,7 @@ def test_one_bad_image_does_not_lose_the_poses_of_others(
 ) -> None:
     found = dict(localize_files(localizer, folder, frames[0].camera))
     assert (found["broken.jpg"].status, found["small.png"].status) == ("unreadable", "other_size")
-    alone = localizer.localize(cv2.imread(str(folder / "a.png"), 0), frames[0].camera)
+    alone = localizer.localize(read_grey(folder / "a.png"), frames[0].camera)
     assert same_bits(found["a.png"].map_from_cam, alone.map_from_cam)
     with pytest.raises(FeatureError, match=r"broken\.jpg: cannot be read as an image"):
         localize_files(localizer, folder / "broken.jpg", frames[0].camera)
