@@ -113,6 +113,7 @@ def dataset(
     workers: int = 2,
     sensors: str = "standard",
     changes: str = "standard",
+    feature: str = "sift",
     repeats: int = 0,
     repeat_share: float = 0.1,
     unit: Literal["m", "cm", "mm"] | None = None,
@@ -132,6 +133,7 @@ def dataset(
         workers: processes; their number does not change the result
         sensors: standard, ideal, or a sensors.toml
         changes: what changes between mapping and robot: standard, none, or a changes.toml
+        feature: the feature of maps and views: sift, aliked, ...
         repeats: further localizations with new noise, of a share of the views
         repeat_share: share of the views that are localized again
         unit: unit of the meshes; by default they have to look like metres
@@ -145,7 +147,7 @@ def dataset(
 
     refuse_lenses(load_sensors(sensors), where=sensors)
     mesh = _mesh_options(scenes, unit=unit, up=up)
-    options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh)
+    options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh, feature)
     made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())
     for row in made:
         again = "" if not row.repeats else f", {row.repeats} repeats: {100 * row.flipped:.1f} % change the label"

@@ -215,7 +215,8 @@ class MeshSource(SceneSource):
 class DatasetOptions:
     """What is asked for of every scene: places, directions, sensors and changes by name or file, and repeats.
 
-    ``mesh`` says how the meshes among the scenes are to be read.
+    ``mesh`` says how the meshes among the scenes are to be read, ``feature`` with which feature they are mapped and
+    views are localized.
     """
 
     seed: int = 0
@@ -226,6 +227,7 @@ class DatasetOptions:
     repeats: int = 0
     repeat_share: float = 0.1
     mesh: MeshOptions = dataclasses.field(default_factory=MeshOptions)
+    feature: str = "sift"
 
 
 def make_scenes(
@@ -261,7 +263,7 @@ def make_scenes(
         sensors=load_sensors(options.sensors),
         changes=find_changes(options.changes),
     )
-    rules = DatasetRules(repeats=options.repeats, repeat_share=options.repeat_share)
+    rules = DatasetRules(feature=options.feature, repeats=options.repeats, repeat_share=options.repeat_share)
     make_dataset(
         [_source(name, chosen, options.mesh) for name in scenes],
         out,

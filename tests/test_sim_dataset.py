@@ -200,6 +200,7 @@ def test_a_mesh_is_a_source_whose_keys_follow_its_content(tmp_path: Path) -> Non
         (["room"], DatasetOptions(sensors="idle"), r"unknown sensors 'idle'; did you mean 'ideal'\?"),
         (["room"], DatasetOptions(changes="some"), r"unknown changes 'some'"),
         (["room"], DatasetOptions(repeat_share=0.0), r"--repeat-share 0: expected more than 0"),
+        (["room"], DatasetOptions(feature="alikd"), r"unknown feature 'alikd'; did you mean 'aliked'\?"),
         (["room", "room"], DatasetOptions(), r"scenes are room, room; expected each once"),
         (["gone.glb"], DatasetOptions(), r"gone.glb: no such file; expected a mesh"),
     ],

@@ -16,10 +16,13 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from fieldkit.dataset import worker
 from fieldkit.dataset.folder import WORK_FOLDER, enter, own, settle, tidy
 from fieldkit.dataset.source import ViewSource
 from fieldkit.errors import DatasetError
+from fieldkit.features import feature_name
 from fieldkit.store import library_versions
 from fieldkit.store.datasets import MAPS_FOLDER, DatasetFile, DatasetRules, scene_path
 from fieldkit.store.files import plain
@@ -80,9 +83,10 @@ def make_dataset(
     are the options of the sources as plain values: they are stored, and have to agree with those of an existing
     folder. ``force`` makes the shards of these ``sources`` again that were made otherwise and keeps the maps that still
     fit; other scenes of the folder stay, or the settings have to be theirs. Raises DatasetError or StoreError where
-    the folder cannot be used, or a scene cannot be read or mapped.
+    the folder cannot be used, or a scene cannot be read or mapped, and FeatureError for an unknown feature.
     """
     rules, out = rules or DatasetRules(), Path(out)
+    rules = msgspec.structs.replace(rules, feature=feature_name(rules.feature))
     names = [s.name for s in sources]
     if not names or len(set(names)) < len(names):
         raise DatasetError(f"scenes are {', '.join(names) or 'none'}; expected each once", hint="name a scene once")
