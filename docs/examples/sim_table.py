@@ -1,0 +1,121 @@
+"""Print the simulation table of a run on a dataset as Markdown: recall, paired comparisons, distance to the best view.
+
+``python docs/examples/sim_table.py DATASET RUN --learned vpt --heuristic max``, where RUN was written by ``fieldkit
+replay DATASET``, and the two policies are those that were best on the validation scenes. Where every view of the
+dataset was localized twice (``--repeats 1 --repeat-share 1``), best possible is also counted over views that
+succeeded both times. ``--curves FILE.svg`` draws the cumulative errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from fieldkit import scores
+from fieldkit.report.figures import curve_svg
+from fieldkit.store import read_run
+from fieldkit.store.datasets import read_dataset, read_scene, read_scene_shard
+from fieldkit.types import Run
+
+MARGIN = 0.03
+JUDGED = (0.1, 1.0)
+
+
+def repeatable(dataset: Path) -> float | None:
+    """Return the share of waypoints with a candidate that succeeded every time; None without repeats of all views."""
+    found = []
+    for name in read_dataset(dataset).scenes:
+        entry = read_scene(dataset, name)
+        for waypoint in entry.waypoints:
+            shard = read_scene_shard(dataset, entry, waypoint)
+            if set(shard.repeat_view.tolist()) != set(range(len(shard.view_ids))):
+                return None
+            lost = set(shard.repeat_view[~shard.repeat_label].tolist())
+            sweep = [i for i, kind in enumerate(shard.kinds) if kind == "sweep"]
+            found.append(any(shard.label[i] and i not in lost for i in sweep))
+    return sum(found) / len(found)
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
+
+
+def recall_table(run: Run) -> str:
+    """Return recall with its interval per policy, and what could not be run."""
+    found = scores.table(run)
+    lines = [markdown(found.header, found.rows), "", found.caption]
+    lines += [f"Not run: {e.what}: {e.reason}" for e in run.excluded]
+    return "\n".join(lines)
+
+
+def comparison_table(run: Run, learned: str, heuristic: str) -> str:
+    """Return the chosen learned policy against the chosen heuristic, per threshold and occlusion."""
+    pairs = [p for p in scores.learned_pairs(run.trials) if (p[0][0], p[1][0]) == (learned, heuristic)]
+    thresholds = run.protocol.thresholds
+    rows = [
+        [
+            f"{c.a[0]} - {c.b[0]}",
+            "yes" if c.a[1] else "no",
+            f"{c.threshold.position_m:g} m / {c.threshold.rotation_deg:g} deg",
+            f"{100 * c.difference:+.1f}",
+            f"{100 * c.interval[0]:+.1f} .. {100 * c.interval[1]:+.1f}",
+            f"{c.n_a_only:g} / {c.n_b_only:g}",
+            f"{c.p:.4f}",
+            f"{c.p_corrected:.4f}",
+            _verdict(c),
+        ]
+        for c in scores.compare(run.trials, pairs, thresholds=thresholds, pose=run.protocol.pose, seed=run.seed)
+    ]
+    head = ["difference", "occlusion", "threshold", "points", "95 %", "only a / only b", "p", "p (Holm)", "verdict"]
+    return markdown(head, rows)
+
+
+def _verdict(found: scores.Comparison) -> str:
+    if found.interval[0] > 0.0:
+        return "better"
+    return f"not worse by {100 * MARGIN:.0f}" if found.interval[0] > -MARGIN else "open"
+
+
+def distance_table(run: Run, learned: str, heuristic: str, honest: float | None) -> str:
+    """Return which share of the distance from the heuristic to the best possible view the learned policy covers."""
+    bound = next(t for t in run.protocol.thresholds if (t.position_m, t.rotation_deg) == JUDGED)
+    groups = scores.group(run.trials)
+    lucky = scores.recall(groups[scores.BEST_POSSIBLE, None], bound, pose=run.protocol.pose)
+    rows = []
+    for occlusion in (True, False):
+        ours, theirs = (
+            scores.recall(groups[policy, occlusion], bound, pose=run.protocol.pose) for policy in (learned, heuristic)
+        )
+        cells = [f"{100 * _share(ours, theirs, best):.0f} %" for best in (lucky, honest) if best is not None]
+        rows.append(["yes" if occlusion else "no", f"{100 * theirs:.1f}", f"{100 * ours:.1f}", *cells])
+    names = [f"of the distance to {100 * lucky:.1f} (lucky)"]
+    names += [] if honest is None else [f"to {100 * honest:.1f} (repeatable)"]
+    return markdown(["occlusion", heuristic, learned, *names], rows)
+
+
+def _share(ours: float, theirs: float, best: float) -> float:
+    return (ours - theirs) / (best - theirs) if best > theirs else math.nan
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--learned", default="vpt")
+    parser.add_argument("--heuristic", default="max")
+    parser.add_argument("--curves", type=Path)
+    args = parser.parse_args()
+    run = read_run(args.run)
+    print(recall_table(run), end="\n\n")
+    if any(p[0][0] == args.learned and p[1][0] == args.heuristic for p in scores.learned_pairs(run.trials)):
+        print(comparison_table(run, args.learned, args.heuristic), end="\n\n")
+        print(distance_table(run, args.learned, args.heuristic, repeatable(args.dataset)))
+    if args.curves is not None:
+        args.curves.write_text(curve_svg(run, "position", name="curves"), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
