@@ -250,6 +250,17 @@ def test_a_damaged_map_is_named(tmp_path: Path, rng: np.random.Generator, damage
         load_map(path)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_landmarks_that_are_not_finite_are_named_when_the_map_is_loaded(
+    tmp_path: Path, rng: np.random.Generator, value: float
+) -> None:
+    scene_map = make_map(rng, n_landmarks=50, n_images=4)
+    scene_map.xyz[scene_map.observation_landmark[0], 2] = value
+    write_map(tmp_path / "room.map", scene_map)
+    with pytest.raises(MapError, match=r"points3D\.bin: 1 of \d+ points are not finite; expected finite positions"):
+        load_map(tmp_path / "room.map")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
