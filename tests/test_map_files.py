@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from synthetic_map import make_map, write_map
 from test_maps import image_folder
 
+from fieldkit import map_commands
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError
 from fieldkit.frames import Pose
@@ -141,3 +143,28 @@ def test_maps_of_other_versions_say_so_in_one_line(
     file.write_text(file.read_text().replace(old, new, 1))
     with pytest.raises(FieldkitError, match=message):
         load_map(tmp_path / "lab.map")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_landmarks_that_are_not_finite_are_named_when_the_map_is_loaded(
+    tmp_path: Path, rng: np.random.Generator, value: float
+) -> None:
+    scene_map = make_map(rng, n_landmarks=50, n_images=4)
+    scene_map.xyz[scene_map.observation_landmark[0], 2] = value
+    write_map(tmp_path / "room.map", scene_map)
+    with pytest.raises(MapError, match=r"points3D\.bin: 1 of \d+ points are not finite; expected finite positions"):
+        load_map(tmp_path / "room.map")
+
+
+def test_what_a_map_holds_is_told_with_a_warning_where_its_files_are_others(
+    tmp_path: Path, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "room.map"
+    write_map(path, make_map(rng, n_landmarks=50, n_images=4))
+    map_commands.map_info(path)
+    assert not caplog.messages
+    with (path / "features.h5").open("ab") as file:
+        file.write(b"more")
+    map_commands.map_info(path)
+    assert len(caplog.messages) == 1
+    assert re.search(r"room\.map: its files have another digest than map\.toml names", caplog.messages[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 from numpy.typing import NDArray
-from synthetic_map import CAMERA, as_model, looking, make_map, room_points, write_map
+from synthetic_map import CAMERA, as_model, looking, make_map, write_map
 from test_align import walk
 
 from fieldkit.cameras import Camera
@@ -30,7 +29,6 @@ from fieldkit.maps.sources.source import SourceImage, read_source
 from fieldkit.maps.structure.pairs import choose_pairs
 from fieldkit.maps.structure.plausible import plausible_matches
 from fieldkit.maps.structure.rigs import write_cameras
-from fieldkit.maps.structure.sfm import reconstruct, write_verified
 from fieldkit.maps.structure.strays import strays
 from fieldkit.store import Rig, RigCamera, write_camera, write_rig, write_tum
 from fieldkit.types import Surface
@@ -106,31 +104,6 @@ def test_a_rig_is_one_body_and_a_lone_camera_its_own(tmp_path: Path, rng: np.ran
         assert rig_from_cam is not None
         assert cameras[0] is not None
         assert np.allclose(found, (rig_from_cam.inv() * cameras[0]).as_matrix()[:3], atol=1e-12)
-
-
-def test_the_progress_of_sfm_counts_the_frames_of_a_rig(tmp_path: Path, rng: np.random.Generator) -> None:
-    rig_from_cam = {name: looking(np.array([0.0, y, 0.0]), 0.3 * y) for name, y in (("a", -0.2), ("b", 0.2))}
-    images, features, seen_by = [], [], []
-    xyz = room_points(rng, 400)
-    for frame in range(5):
-        map_from_rig = Pose.from_translation([-0.3 * frame, 0.2 * frame, 1.3])
-        for name, pose in rig_from_cam.items():
-            pixels, seen = CAMERA.project((map_from_rig * pose).inv().apply(xyz))
-            images.append(SourceImage(f"{name}/{frame}.jpg", Path(), CAMERA, name, str(frame), None, pose))
-            ones = np.ones(seen.sum(), dtype=np.float32)
-            descriptors = np.zeros((len(ones), 128), dtype=np.uint8)
-            features.append(Features(pixels[seen].astype(np.float32), ones, ones, descriptors))
-            seen_by.append(np.flatnonzero(seen))
-    pairs = list(itertools.combinations(range(len(images)), 2))
-    both = [np.intersect1d(seen_by[a], seen_by[b], return_indices=True)[1:] for a, b in pairs]
-    matches = [np.column_stack(rows).astype(np.uint32) for rows in both]
-    write_verified(tmp_path / "database.db", images, features, pairs, matches, seed=0, n_threads=1)
-    told: list[tuple[int, int]] = []
-    models = reconstruct(
-        tmp_path / "database.db", images, seed=0, progress=lambda step, done, total: told.append((done, total))
-    )
-    assert models[0].num_reg_images() == 10
-    assert told == [(0, 5), (3, 5), (4, 5), (5, 5)]
 
 
 def test_what_sfm_misplaced_is_told_from_what_slam_misplaced(rng: np.random.Generator) -> None:
@@ -248,17 +221,6 @@ def test_a_damaged_map_is_named(tmp_path: Path, rng: np.random.Generator, damage
     damage(path)  # type: ignore[operator]
     with pytest.raises(FieldkitError, match=message):
         load_map(path)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_landmarks_that_are_not_finite_are_named_when_the_map_is_loaded(
-    tmp_path: Path, rng: np.random.Generator, value: float
-) -> None:
-    scene_map = make_map(rng, n_landmarks=50, n_images=4)
-    scene_map.xyz[scene_map.observation_landmark[0], 2] = value
-    write_map(tmp_path / "room.map", scene_map)
-    with pytest.raises(MapError, match=r"points3D\.bin: 1 of \d+ points are not finite; expected finite positions"):
-        load_map(tmp_path / "room.map")
 
 
 @pytest.mark.parametrize(
