@@ -67,6 +67,21 @@ def test_files_that_are_no_images_say_what_is_wrong(tmp_path: Path, content: byt
     assert read_header(tmp_path / "none.jpg") == "cannot be read: No such file or directory"
 
 
+def test_a_jpeg_that_no_decoder_takes_is_named_by_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "image.jpg"
+    cv2.imwrite(str(path), np.full((48, 64), 128, dtype=np.uint8))
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"\xff\xdb\x00\x43\x00", b"\xff\xdb\x00\x43\x0f", 1))
+    assert read_header(path) == "is damaged, its content cannot be decoded"
+
+
+def struck(path: Path, at: float) -> None:
+    """Change one byte of a file."""
+    content = bytearray(path.read_bytes())
+    content[int(at * len(content))] ^= 0x55
+    path.write_bytes(content)
+
+
 def with_depth(path: Path, depth: np.ndarray) -> None:
     (path / "depth").mkdir()
     write_camera(path / "depth_camera.toml", SIZE)
@@ -81,6 +96,9 @@ def with_depth(path: Path, depth: np.ndarray) -> None:
         (lambda p: (p / "images" / "003.png").write_bytes(b"broken"), r"003\.png: cannot be read as an image"),
         (lambda p: (p / "images" / "003.png").write_bytes((p / "images" / "002.png").read_bytes()[:60]),
          r"003\.png: is cut off; expected"),
+        (lambda p: struck(p / "images" / "002.png", 0.6), r"002\.png: is damaged, its content cannot be decoded; exp"),
+        (lambda p: (with_depth(p, np.full((48, 64), 900, np.uint16)), struck(p / "depth" / "001.png", 0.6)),
+         r"depth/001\.png: is damaged, its content cannot be decoded; expected a 16-bit depth image"),
         (lambda p: shutil.copy(p / "images" / "001.png", p / "images" / "001.bmp"),
          r"001\.bmp and 001\.png have one name"),
         (lambda p: with_depth(p, np.zeros((24, 32), np.uint16)), r"001\.png: is 32x24; expected a 16-bit depth image"),
