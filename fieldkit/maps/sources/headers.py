@@ -61,7 +61,7 @@ def read_header(path: Path) -> ImageHeader | str:
 def _intact(path: Path, head: bytes) -> bool:
     """Tell whether the pixels of a PNG or JPEG file can be decoded.
 
-    A PNG says so by its checksums; of a JPEG, which has none, an eighth is decoded. Garbled pixels of a JPEG are pixels.
+    A PNG says so by its checksums; a JPEG, which has none, is decoded at an eighth: garbled pixels are pixels.
     """
     if head.startswith(b"\x89PNG"):
         return _png_sums(path)
