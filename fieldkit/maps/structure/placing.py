@@ -199,7 +199,7 @@ def _refuse_unposed(walk: MapSource, placed: Collection[int], others: Sequence[S
     if walk.n_posed < MIN_POSES or len(posed(placed)) >= MIN_POSES or len(posed(best)) < MIN_POSES:
         return
     raise MapError(
-        f"{walk.path}: the images fall into pieces: {len(posed(placed))} of the {len(placed)} in the largest have a SLAM "
+        f"{walk.path}: the images are in pieces: {len(posed(placed))} of the {len(placed)} in the largest have a SLAM "
         f"pose, but {len(posed(best))} of {len(best)} others ({_named(walk, best)}); expected poses in the largest",
         hint="map the piece with poses by itself, add images between the pieces, or give the largest its poses, too",
     )
