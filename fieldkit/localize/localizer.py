@@ -14,6 +14,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import LocalizeError
 from fieldkit.features import Descriptors, open_extractor, working_factor
 from fieldkit.features.appearance import open_appearance
+from fieldkit.features.used import weight_files
 from fieldkit.frames import Pose, compose_covariance
 from fieldkit.localize.chance import Agreement, confidence
 from fieldkit.localize.matching import expected_noise, landmark_noise, open_matcher
@@ -22,6 +23,7 @@ from fieldkit.localize.parallel import default_threads, in_threads
 from fieldkit.localize.pose import PosedPoints, Solved, estimate_pose, residuals_px
 from fieldkit.localize.retrieval import build_index, most_similar, nearest_vectors
 from fieldkit.protocol import LocalizerRules
+from fieldkit.store import digest
 from fieldkit.store.inputs import RigCamera
 from fieldkit.types import Estimate, Image, SceneMap
 from fieldkit.warp import shared_errors
@@ -140,11 +142,18 @@ class Localizer:
         stated = scene_map.retrieval
         self._appearance = None if stated is None else open_appearance(stated, weights=weights)
         self._shared = shared_errors(scene_map)
+        used = weight_files(scene_map.feature, matcher=self._rules.matcher, retrieval=stated, folder=weights)
+        self._weights = digest(*used) if used else ""
 
     @property
     def colour(self) -> bool:
         """Whether the map's feature or retrieval looks at colours: give it RGB images then."""
         return self._kind.colour or self._appearance is not None
+
+    @property
+    def weights_digest(self) -> str:
+        """The digest of the networks' weight files, empty without networks: other weights give other estimates."""
+        return self._weights
 
     def localize(self, image: Image, camera: Camera, *, prior: CameraPrior | None = None) -> Estimate:
         """Find map_from_cam of an image uint8[h, w] or RGB; a failure is an Estimate without a pose and its reason.

@@ -20,6 +20,7 @@ from fieldkit.errors import MapError, SurfaceError
 from fieldkit.features import Extractor, Features, feature_name, open_extractor
 from fieldkit.features.appearance import Appearance, open_appearance
 from fieldkit.features.matchers import PairMatcher, open_matcher
+from fieldkit.features.used import weight_files
 from fieldkit.frames import Pose
 from fieldkit.maps.io import (
     AlignmentEntry,
@@ -102,7 +103,8 @@ def build_map(
     appearance = None if options.retrieval == "own" else open_appearance(options.retrieval, weights=options.weights)
     walk = without_poses(walk) if options.poses == "none" else walk
     versions = library_versions()
-    key = digest(feature, repr(options), repr((seed, versions)), *_program(), *content(walk))
+    networks = weight_files(feature, matcher=options.matcher, retrieval=options.retrieval, folder=options.weights)
+    key = digest(feature, repr(options), repr((seed, versions)), *networks, *_program(), *content(walk))
     with resumed(out, key) as stages:
         with stages.timed("tags") if options.tag_sizes_m else contextlib.nullcontext():
             tags = look_for_tags(walk, options, progress=tell)
