@@ -28,6 +28,8 @@ _SCALE = 3.0
 _ITERATIONS = 20
 # Share of the variance that matches in one cell have in common: they lie on the same edges, lit and blurred alike
 _SHARED, _CELL_PX = 0.5, 16.0
+# Information that every pose has: what matches leave open has a standard deviation of 100 rad and 100 m, not none
+_UNKNOWN = 1e-4 * np.eye(6)
 # Median of chi-square with 2 degrees of freedom
 _MEDIAN_CHI2 = 2.0 * math.log(2.0)
 # Shares of the inlier bound at which RANSAC is started. Distant, nearly planar landmarks have two poses that agree
@@ -157,7 +159,8 @@ def refine_pose(
     Every residual is whitened by its own 2x2 covariance: ``noise`` times the expected one plus the landmark's
     uncertainty projected into the image; those of ``scale`` standard deviations have half of the weight. The
     covariance is that of an M-estimator (Huber and Ronchetti, Robust Statistics, 7.6) whose noise is the residuals',
-    pooled with the expected; it takes the landmarks' errors as independent. The last is how the pose follows the
+    pooled with the expected; it takes the landmarks' errors as independent, and directions that the matches leave open
+    as unknown (100 rad, 100 m). The last is how the pose follows the
     landmarks.
     """
     stacked = _Stacked.of(cameras)
@@ -170,9 +173,9 @@ def refine_pose(
     variance = (0.5 * slope @ squared + EXPECTED_MATCHES) / (max(slope.sum() - 3.0, 0.0) + EXPECTED_MATCHES)
     weighted = slope[:, None, None] * by_pose
     alone = np.einsum("nai,naj->ij", weighted, by_pose)
-    inverse = np.linalg.pinv(alone, hermitian=True)
+    inverse = np.linalg.inv(alone + _UNKNOWN)
     response = -np.einsum("ij,njk->ink", inverse, np.einsum("naj,nak->njk", weighted, by_landmark))
-    spread = inverse @ ((1.0 - _SHARED) * alone + _SHARED * _crowded(stacked, weighted)) @ inverse
+    spread = inverse @ ((1.0 - _SHARED) * alone + _SHARED * _crowded(stacked, weighted) + _UNKNOWN) @ inverse
     return refined, 0.5 * variance * (spread + spread.T), response.reshape(6, -1)
 
 
