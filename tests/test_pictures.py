@@ -208,8 +208,8 @@ def test_photos_are_read_in_colour_for_features_that_look_at_it(
     assert rgb is not None
     assert grey is not None
     # The brightest of 16-bit pixels become white, here those of the red channel
-    stored = rgb.astype(float) * (picture.max() / rgb.max())
-    np.testing.assert_allclose(stored[:, :, 0], picture, atol=3)
+    stored = rgb.astype(float) * (np.median(picture) / np.median(rgb[:, :, 0]))
+    np.testing.assert_allclose(np.minimum(stored[:, :, 0], 200), np.minimum(picture, 200), atol=3)
     np.testing.assert_allclose(stored[:, :, 2], picture // 4, atol=3)
     assert np.corrcoef(to_grey(rgb).ravel(), grey.ravel())[0, 1] > 0.999
     covered = _without_tags(rgb, find(folder)[0][0].usable)
