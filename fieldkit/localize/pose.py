@@ -41,7 +41,7 @@ _STARTS = (1.0, 0.3, 0.12)
 class PosedPoints:
     """Matches of a camera: undistorted pixels from the principal point (n, 2), their expected noise per axis in px (n),
     landmarks (n, 3), their covariances (n, 3, 3), and the focal lengths in px; ``rig_from_cam`` where the camera is
-    one of a rig.
+    one of a rig. ``stretch`` (n): by how much undistorting magnified the image there, None without distortion.
     """
 
     pixels: Array
@@ -50,6 +50,7 @@ class PosedPoints:
     xyz_covariance: Array
     focal_px: tuple[float, float]
     rig_from_cam: Pose | None = None
+    stretch: Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,10 +297,11 @@ def _inliers(cameras: Sequence[PosedPoints], map_from_rig: Pose, max_error_px: f
 
 
 def residuals_px(camera: PosedPoints, map_from_rig: Pose) -> Array:
-    """Return f64[n]: by how many pixels matches miss their landmarks; inf behind the camera."""
+    """Return f64[n]: by how many pixels of the image matches miss their landmarks; inf behind the camera."""
     x_in_cam = (map_from_rig * _from_rig(camera)).inv().apply(camera.xyz)
     depth = np.maximum(x_in_cam[:, 2:], MIN_DEPTH_M)
     missed = np.linalg.norm(x_in_cam[:, :2] / depth * camera.focal_px - camera.pixels, axis=1)
+    missed = missed if camera.stretch is None else missed / camera.stretch
     return np.where(x_in_cam[:, 2] > 0, missed, np.inf)
 
 
@@ -315,4 +317,5 @@ def subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
         sigma_px=points.sigma_px[rows],
         xyz=points.xyz[rows],
         xyz_covariance=points.xyz_covariance[rows],
+        stretch=None if points.stretch is None else points.stretch[rows],
     )
