@@ -33,7 +33,8 @@ def read_kalibr(path: Path) -> tuple[KalibrCamera, ...]:
     """Read all cameras of a camchain.yaml; the rig is the IMU where the file says where that is, else cam0.
 
     Kalibr puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5): the principal point is converted.
-    Raises StoreError for another camera or distortion model than pinhole with radtan, equidistant or none.
+    Raises StoreError for another camera or distortion model than pinhole with radtan, equidistant or none, and where a
+    camera in the middle of a chain is missing.
     """
     try:
         values = YAML(typ="safe").load(read_text(path, what=_WHAT))
@@ -45,6 +46,8 @@ def read_kalibr(path: Path) -> tuple[KalibrCamera, ...]:
         raise StoreError(f"{path}: no cam0 in it; expected {_WHAT}", hint="give Kalibr's camchain.yaml")
     names.sort(key=lambda n: (len(str(n)), str(n)))
     with_imu = all("T_cam_imu" in values[n] for n in names)
+    if not with_imu:
+        _refuse_gaps(path, [str(n) for n in names])
     result: list[KalibrCamera] = []
     for name in names:
         entry, place = values[name], f"{path}: {name}"
@@ -56,6 +59,19 @@ def read_kalibr(path: Path) -> tuple[KalibrCamera, ...]:
             rig_from_cam = result[-1].rig_from_cam * _transform(entry, "T_cn_cnm1", place).inv()
         result.append(KalibrCamera(str(name), _camera(entry, place), rig_from_cam))
     return tuple(result)
+
+
+def _refuse_gaps(path: Path, names: list[str]) -> None:
+    """Raise StoreError where a camera is placed by one that is not there: T_cn_cnm1 is of the camera before."""
+    first = int(names[0][3:]) if names[0][3:].isdigit() else 0
+    expected = [f"cam{first + k}" for k in range(len(names))]
+    if len(names) > 1 and names != expected:
+        missing = next(e for e, n in zip(expected, names, strict=True) if e != n)
+        raise StoreError(
+            f"{path}: has {', '.join(names)} but no {missing}; expected a chain without a gap, as T_cn_cnm1 is of the "
+            "camera before",
+            hint=f"add {missing}, or give every camera its T_cam_imu",
+        )
 
 
 def _camera(entry: dict[str, Any], place: str) -> Camera:
