@@ -208,7 +208,7 @@ def test_the_first_key_that_does_not_fit_is_named() -> None:
         ({"first.bias": torch.tensor([0.0, torch.nan])}, r"'first\.bias' holds values that are not finite"),
         (
             {"first.bias": torch.zeros(2).half()},
-            r"'first\.bias' is float16; expected float32: rounded weights",
+            r"'first\.bias' is float16; expected float32: converted weights",
         ),
         ({"second.bias": torch.zeros(2)}, r"'second\.bias' is no part of ModuleDict"),
         ({"norm.running_var": None}, r"no 'norm\.running_var' in it"),

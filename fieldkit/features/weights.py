@@ -266,7 +266,7 @@ def fill_network(
         if tensor.is_floating_point() and stored[key].dtype != tensor.dtype:
             # They would be converted without a word, integers too
             raise WeightsError(
-                f"{path}: {key!r} is {_kind(stored[key])}; expected {_kind(tensor)}: rounded weights find others",
+                f"{path}: {key!r} is {_kind(stored[key])}; expected {_kind(tensor)}: converted weights find others",
                 hint="take the published file",
             )
         if not bool(torch.isfinite(stored[key]).all()):

@@ -59,9 +59,9 @@ def read_header(path: Path) -> ImageHeader | str:
 
 
 def _intact(path: Path, head: bytes) -> bool:
-    """Tell whether the pixels of a PNG or JPEG file can be decoded.
+    """Tell whether a PNG's checksums are right, or a JPEG, which has none, can be decoded at an eighth.
 
-    A PNG says so by its checksums; a JPEG, which has none, is decoded at an eighth: garbled pixels are pixels.
+    Garbled pixels are pixels, and of other formats nothing is told.
     """
     if head.startswith(b"\x89PNG"):
         return _png_sums(path)
