@@ -172,6 +172,7 @@ def _judge_estimates(results: Sequence[ViewResult], cameras: Cameras, gauge: Gau
         "failed": failed,
         "median_position_m": _median([e["position_m"] for e in entries] + infinite),
         "median_rotation_deg": _median([e["rotation_deg"] for e in entries] + infinite),
+        "nees_median": _median([e["nees"] for e in entries]),
         "nees_trimmed": trimmed_mean([e["nees"] for e in entries]),
     }
 

@@ -163,7 +163,7 @@ def map_export(
 
 
 def map_info(path: Positional[Path], *, json: bool = False) -> None:
-    """Say what a map holds and how well it was aligned.
+    """Say what a map holds and how well it was aligned, with a warning where its files are not those of its digest.
 
     Args:
         path: map folder
@@ -173,6 +173,8 @@ def map_info(path: Positional[Path], *, json: bool = False) -> None:
 
     found = maps.map_info(path)
     print_json(found) if json else print_mapping(found, title=str(path))
+    if (doubt := maps.changed(path)) is not None:
+        _log.warning("%s", doubt)
 
 
 def map_compact(path: Positional[Path], *, out: Path, force: bool = False) -> None:

@@ -215,7 +215,7 @@ def _replay_session(
                 chosen,
                 known.truths,
                 protocol,
-                made_of=(scene_map.digest, *(file.digest for file in applied)),
+                made_of=(scene_map.digest, localizer.weights_digest, *(file.digest for file in applied)),
                 localizer=localizer,
                 cache=cache,
             )

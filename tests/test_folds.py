@@ -184,3 +184,10 @@ def test_two_places_that_nothing_connects_are_named(tmp_path: Path, rng: np.rand
     strict = MapOptions(n_threads=1, min_registered=0.7)
     with pytest.raises(MapError, match=r"9 of 15 images registered; 6 others .* hang together by themselves; expected"):
         place_once(found, Stages(tmp_path, {}), strict, seed=0, progress=quiet)
+    unposed = tuple(dataclasses.replace(image, slam_from_cam=None) for image in images[:9])
+    halves = dataclasses.replace(found, walk=MapSource(Path("flats"), unposed + tuple(images[9:]), None, ()))
+    told = (
+        r"0 of the 9 in the largest have a SLAM pose, but 6 of 6 others \(009.jpg, .*map the piece with poses by itself"
+    )
+    with pytest.raises(MapError, match=told):
+        place_once(halves, Stages(tmp_path, {}), MapOptions(n_threads=1), seed=0, progress=quiet)

@@ -67,6 +67,24 @@ def test_a_chain_of_transforms_becomes_a_rig(tmp_path: Path) -> None:
         assert max(pose_error(camera.rig_from_cam, expected)) < 1e-9
 
 
+def test_a_part_of_a_chain_without_a_gap_is_a_rig_too(tmp_path: Path) -> None:
+    rig = read_rig(chain(tmp_path / "camchain.yaml", CAM0.replace("cam0", "cam1") + CAM1.replace("cam1", "cam2")))
+    assert [c.name for c in rig.cameras] == ["cam1", "cam2"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (CAM1 + CAM1.replace("cam1", "cam2"), "has cam1, cam2 but no cam0; expected a chain without a gap"),
+        (CAM1, "has cam1 but no cam0"),
+        (CAM0 + CAM1.replace("cam1", "cam_left"), "has cam_left, cam0; expected cam0, cam1, .., as T_cn_cnm1"),
+    ],
+)
+def test_a_camera_that_places_another_has_to_be_there(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=message):
+        read_rig(chain(tmp_path / "camchain.yaml", text))
+
+
 def test_with_the_imu_known_the_rig_is_the_imu(tmp_path: Path) -> None:
     rows = "".join(f"  - {row}\n" for row in ([1.0, 0, 0, 0.1], [0, 1.0, 0, 0.2], [0, 0, 1.0, 0.3], [0, 0, 0, 1.0]))
     rig = read_rig(chain(tmp_path / "camchain-imucam.yaml", f"{CAM0}  T_cam_imu:\n{rows}"))
@@ -84,6 +102,7 @@ def test_with_the_imu_known_the_rig_is_the_imu(tmp_path: Path) -> None:
         (CAM0 + CAM1.replace("[0.0, 0.0, 1.0, 0.03]", "[0.0, 0.0, -1.0, 0.03]"), "cam1: T_cn_cnm1 is no rigid"),
         (CAM0 + CAM1.replace("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 2.0]"), "cam1: T_cn_cnm1 is no rigid"),
         (CAM0 + CAM1.replace("T_cn_cnm1", "T_other"), "cam1: T_cn_cnm1 is no rigid transform"),
+        (CAM0 + CAM1.replace("cam1", "cam2"), "has cam0, cam2 but no cam1; expected a chain without a gap"),
         ("a: [1", "not valid YAML"),
         ("[1, 2]", "no cam0 in it"),
     ],

@@ -75,6 +75,18 @@ def test_the_covariance_predicts_the_error_in_right_perturbations_rotation_first
     )
 
 
+def test_a_direction_that_matches_leave_open_is_unknown_not_certain(rng: np.random.Generator) -> None:
+    truth, points = scene(rng, 12)
+    on_a_line = np.column_stack([np.linspace(-1.0, 1.0, 12), np.zeros(12), np.full(12, 3.0)])
+    pixels = on_a_line[:, :2] / on_a_line[:, 2:] * FOCAL
+    row = dataclasses.replace(points, xyz=truth.apply(on_a_line), pixels=pixels)
+    _, covariance, _ = refine_pose([row], truth, noise=1.0)
+    # Turned about the line, and seen from where it looks the same
+    about = np.array([1.0, 0.0, 0.0, 0.0, 3.0, 0.0]) / np.sqrt(10.0)
+    assert about @ covariance @ about > 100.0
+    assert np.diag(covariance)[[1, 2]].max() < 0.01
+
+
 def test_certain_landmarks_count_more_than_uncertain_ones(rng: np.random.Generator) -> None:
     weighted, plain = [], []
     for _ in range(40):

@@ -212,3 +212,20 @@ def test_localizing_is_independent_of_what_was_localized_before() -> None:
         assert a.status == b.status
         if a.map_from_cam is not None and b.map_from_cam is not None:
             np.testing.assert_array_equal(a.map_from_cam.as_matrix(), b.map_from_cam.as_matrix())
+
+
+def test_a_map_without_a_surface_gives_the_same_rows_without_occlusion(
+    short: Path, short_run: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(SAMPLE / "lab.map", tmp_path / "lab.map")
+    (tmp_path / "lab.map" / "surface.ply").unlink()
+    text = (tmp_path / "lab.map" / "map.toml").read_text()
+    old, new = text.split('digest = "')[1].split('"')[0], content_digest(tmp_path / "lab.map")
+    (tmp_path / "lab.map" / "map.toml").write_text(text[: text.index("[surface]")].replace(old, new))
+    (tmp_path / "tags.toml").write_text((SAMPLE / "tags.toml").read_text().replace(old, new))
+    run = run_sample(tmp_path / "run", short, lab=tmp_path)
+    (left_out,) = (e for e in run.excluded if "has no surface" in e.reason)
+    assert left_out.what.endswith("with occlusion")
+    with_surface = [row for row in rows(short_run / "trials.csv") if row["occlusion"] != "true"]
+    assert rows(tmp_path / "run" / "trials.csv") == with_surface
+    assert {row["policy"] for row in with_surface} == set(PAPER.policies)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from synthetic_map import make_map, write_map
 from test_maps import image_folder
 
+from fieldkit import map_commands
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, MapError
 from fieldkit.frames import Pose
@@ -65,6 +67,21 @@ def test_files_that_are_no_images_say_what_is_wrong(tmp_path: Path, content: byt
     assert read_header(tmp_path / "none.jpg") == "cannot be read: No such file or directory"
 
 
+def test_a_jpeg_that_no_decoder_takes_is_named_by_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "image.jpg"
+    cv2.imwrite(str(path), np.full((48, 64), 128, dtype=np.uint8))
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"\xff\xdb\x00\x43\x00", b"\xff\xdb\x00\x43\x0f", 1))
+    assert read_header(path) == "is damaged, its content cannot be decoded"
+
+
+def struck(path: Path, at: float) -> None:
+    """Change one byte of a file."""
+    content = bytearray(path.read_bytes())
+    content[int(at * len(content))] ^= 0x55
+    path.write_bytes(content)
+
+
 def with_depth(path: Path, depth: np.ndarray) -> None:
     (path / "depth").mkdir()
     write_camera(path / "depth_camera.toml", SIZE)
@@ -79,6 +96,9 @@ def with_depth(path: Path, depth: np.ndarray) -> None:
         (lambda p: (p / "images" / "003.png").write_bytes(b"broken"), r"003\.png: cannot be read as an image"),
         (lambda p: (p / "images" / "003.png").write_bytes((p / "images" / "002.png").read_bytes()[:60]),
          r"003\.png: is cut off; expected"),
+        (lambda p: struck(p / "images" / "002.png", 0.6), r"002\.png: is damaged, its content cannot be decoded; exp"),
+        (lambda p: (with_depth(p, np.full((48, 64), 900, np.uint16)), struck(p / "depth" / "001.png", 0.6)),
+         r"depth/001\.png: is damaged, its content cannot be decoded; expected a 16-bit depth image"),
         (lambda p: shutil.copy(p / "images" / "001.png", p / "images" / "001.bmp"),
          r"001\.bmp and 001\.png have one name"),
         (lambda p: with_depth(p, np.zeros((24, 32), np.uint16)), r"001\.png: is 32x24; expected a 16-bit depth image"),
@@ -141,3 +161,28 @@ def test_maps_of_other_versions_say_so_in_one_line(
     file.write_text(file.read_text().replace(old, new, 1))
     with pytest.raises(FieldkitError, match=message):
         load_map(tmp_path / "lab.map")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_landmarks_that_are_not_finite_are_named_when_the_map_is_loaded(
+    tmp_path: Path, rng: np.random.Generator, value: float
+) -> None:
+    scene_map = make_map(rng, n_landmarks=50, n_images=4)
+    scene_map.xyz[scene_map.observation_landmark[0], 2] = value
+    write_map(tmp_path / "room.map", scene_map)
+    with pytest.raises(MapError, match=r"points3D\.bin: 1 of \d+ points are not finite; expected finite positions"):
+        load_map(tmp_path / "room.map")
+
+
+def test_what_a_map_holds_is_told_with_a_warning_where_its_files_are_others(
+    tmp_path: Path, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "room.map"
+    write_map(path, make_map(rng, n_landmarks=50, n_images=4))
+    map_commands.map_info(path)
+    assert not caplog.messages
+    with (path / "features.h5").open("ab") as file:
+        file.write(b"more")
+    map_commands.map_info(path)
+    assert len(caplog.messages) == 1
+    assert re.search(r"room\.map: its files have another digest than map\.toml names", caplog.messages[0])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_map import CAMERA, looking
@@ -27,8 +28,10 @@ from fieldkit.maps import (
     load_map,
     map_info,
 )
+from fieldkit.maps.metric.choosing import find_frame
 from fieldkit.maps.metric.tagged import TagScale, tag_scale
 from fieldkit.maps.metric.upright import level_cameras, up_rotation
+from fieldkit.maps.sources.source import MapSource, SourceImage
 from fieldkit.store import Rig, RigCamera, read_camera, write_rig, write_tum
 from fieldkit.tags import TagDetection, tag_corners
 
@@ -232,6 +235,27 @@ def test_the_size_of_a_tag_is_the_scale_of_the_map(rng: np.random.Generator) -> 
     assert abs(found.scale * 3.7 - 1) < 4 * found.sigma < 0.02
     assert (found.n_used, found.n_total, found.ids) == (9, 9, (1,))
     assert found.rms_m < 0.003
+
+
+@pytest.mark.parametrize(("size_m", "verdict"), [(0.3, "pass"), (0.33, "warn"), (0.45, "fail")])
+def test_slam_poses_that_contradict_the_size_of_a_tag_do_not_pass(
+    rng: np.random.Generator, size_m: float, verdict: str
+) -> None:
+    seen = sightings(rng, noise_px=0.05)
+    places = [looking(np.array([0.8, y, 1.5 + 0.1 * y]), -0.35 * y) for y in np.linspace(-1.2, 1.2, 9)]
+    places += [looking(np.array([x, 0.0, 1.5]), 0.0) for x in (-1.0, 0.0, 1.5)]
+    images = tuple(SourceImage(f"{i}.png", Path(), CAMERA, "", str(i), place) for i, place in enumerate(places))
+    options = MapOptions(tag_sizes_m={None: size_m})
+    found, told = find_frame(
+        MapSource(Path("walk"), images, None, ()),
+        pycolmap.Reconstruction(),
+        dict(enumerate(as_sfm(places, scale=3.7))),
+        options,
+        tags={i: [d] for i, (_, _, d) in enumerate(seen)},
+        seed=0,
+    )
+    assert (found.source, found.verdict) == ("tags", verdict)
+    assert any("SLAM poses are" in t for t in told) == (verdict != "pass")
 
 
 def test_a_second_tag_of_the_same_number_elsewhere_does_not_count(rng: np.random.Generator) -> None:

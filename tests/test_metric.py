@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -76,9 +77,13 @@ def test_the_map_is_scaled_about_its_cameras() -> None:
     assert scaled.rms_m == pytest.approx(0.0211, abs=1e-4)
 
 
-def test_a_contradiction_keeps_the_slam_scale_and_is_said() -> None:
-    kept, doubts = with_depth_scale(alignment(), DepthScale(0.7, 1e-4, 999), sfm_centres=CENTRES, slam_centres=CENTRES)
+@pytest.mark.parametrize(
+    ("ratio", "verdict", "told"), [(0.9, "warn", r"\+11\.1 %"), (0.7, "fail", r"\+42\.9 %"), (1.4, "fail", r"-28\.6 %")]
+)
+def test_a_contradiction_keeps_the_slam_scale_is_said_and_does_not_pass(ratio: float, verdict: str, told: str) -> None:
+    found = DepthScale(ratio, 1e-4, 999)
+    kept, doubts = with_depth_scale(alignment(), found, sfm_centres=CENTRES, slam_centres=CENTRES)
     assert kept.source == "slam"
     assert kept.map_from_sfm.scale == alignment().map_from_sfm.scale
-    assert kept.verdict == "warn"
-    assert "SLAM poses are +42.9 % off in scale" in doubts[0]
+    assert kept.verdict == verdict
+    assert re.search(f"SLAM poses are {told} off in scale", doubts[0])

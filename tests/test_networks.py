@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import os
 import subprocess
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from synthetic_map import make_map
 
 from fieldkit.errors import FeatureError, WeightsError
 from fieldkit.features import FEATURES, Extractor, Features, open_extractor, read_image, to_grey
@@ -26,6 +28,7 @@ from fieldkit.features.matchers import open_matcher
 from fieldkit.features.matching import match_pair
 from fieldkit.features.superpoint import local_maxima, maps, superpoint_network
 from fieldkit.features.weights import WEIGHTS
+from fieldkit.localize import Localizer
 from fieldkit.maps.structure.pairs import match_pairs
 
 PHOTO = Path(__file__).parents[1] / "docs" / "room.jpg"
@@ -193,6 +196,21 @@ def test_superpoint_takes_the_published_names_and_shapes(tmp_path: Path) -> None
     assert found.descriptors.shape == (len(found), 256)
     np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, atol=1e-5)
     assert same(found, open_extractor("superpoint", weights=tmp_path / "w").extract(photo(150, 101)))
+
+
+def test_a_localizer_tells_estimates_of_other_weights_apart(tmp_path: Path, rng: np.random.Generator) -> None:
+    kept, changed = tmp_path / "kept", tmp_path / "changed"
+    stored_superpoint(kept)
+    stored_superpoint(changed, **{"convDb.bias": torch.ones(256)})
+    made = make_map(rng, n_landmarks=60, n_images=4)
+    described = rng.normal(size=(len(made.descriptors), 256)).astype(np.float32)
+    described /= np.linalg.norm(described, axis=1, keepdims=True)
+    by_network = dataclasses.replace(made, feature="superpoint", descriptors=described)
+    of_kept, of_changed = (Localizer(by_network, weights=folder).weights_digest for folder in (kept, changed))
+    assert of_kept
+    assert of_kept != of_changed
+    assert Localizer(by_network, weights=kept).weights_digest == of_kept
+    assert Localizer(made).weights_digest == ""
 
 
 def test_superpoint_names_the_first_key_that_does_not_fit(tmp_path: Path) -> None:

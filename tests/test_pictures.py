@@ -13,10 +13,12 @@ from PIL import Image as PillowImage
 from scipy.spatial.transform import Rotation
 from tag_scenes import SIZE_M, render_tag
 
+from fieldkit.calibrate.locating import _without_tags
 from fieldkit.calibrate.photos import Shot, find_tags, list_photos, read_photo
 from fieldkit.calibrate.pictures import read_header
 from fieldkit.cameras import Camera
 from fieldkit.errors import StoreError, TagError
+from fieldkit.features import to_grey
 from fieldkit.frames import Pose
 from fieldkit.store import PhotoEntry, write_camera, write_photos
 from fieldkit.types import Image, TagPhoto
@@ -192,6 +194,27 @@ def test_heic_photos_beside_their_jpegs_are_nothing_and_beside_others_warned_of(
     with caplog.at_level(logging.WARNING):
         assert len(list_photos(folder, None)) == 1
     assert "1 files are left out, for example IMG_2.dng" in caplog.text
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_photos_are_read_in_colour_for_features_that_look_at_it(
+    tmp_path: Path, picture: Image, kind: type[np.unsignedinteger]
+) -> None:
+    folder = folder_of(tmp_path)
+    reddish = np.stack([picture // 4, picture // 2, picture], axis=2).astype(kind) * (257 if kind == np.uint16 else 1)
+    cv2.imwrite(str(folder / "a.png"), reddish)
+    (photo,) = list_photos(folder, None)
+    rgb, grey = read_photo(photo, colour=True), read_photo(photo)
+    assert rgb is not None
+    assert grey is not None
+    # The brightest of 16-bit pixels become white, here those of the red channel
+    stored = rgb.astype(float) * (np.median(picture) / np.median(rgb[:, :, 0]))
+    np.testing.assert_allclose(np.minimum(stored[:, :, 0], 200), np.minimum(picture, 200), atol=3)
+    np.testing.assert_allclose(stored[:, :, 2], picture // 4, atol=3)
+    assert np.corrcoef(to_grey(rgb).ravel(), grey.ravel())[0, 1] > 0.999
+    covered = _without_tags(rgb, find(folder)[0][0].usable)
+    assert covered.shape == rgb.shape
+    assert (covered != rgb).any(axis=2).mean() > 0.02
 
 
 @pytest.mark.parametrize("brightest", [65535, 4095], ids=["full range", "12 of 16 bits"])

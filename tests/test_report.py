@@ -125,6 +125,7 @@ def test_page_states_the_seconds_of_map_and_views(run: Run) -> None:
     timed = dataclasses.replace(run, map_seconds={"verify": 12.0}, results=results)
     told = _provenance(timed)
     assert ("Seconds of building the map", "verify 12") in told
+    assert dict(told)["Localizer"].startswith("feature sift, matcher nearest, top 20 retrieved, ")
     assert ("Time per view", "extract 50 (50), pnp 12 (12) ms: median (95th percentile)") in told
     untimed = _provenance(dataclasses.replace(run, results=()))
     assert {("Seconds of building the map", "not known"), ("Time per view", "not known")} <= set(untimed)

@@ -206,6 +206,10 @@ def test_the_first_key_that_does_not_fit_is_named() -> None:
         ({"first.bias": None}, r"net\.pth: no 'first\.bias' in it; expected \[2\]"),
         ({"first.weight": torch.zeros(2, 4)}, r"'first\.weight' is \[2, 4\]; expected \[2, 3\]"),
         ({"first.bias": torch.tensor([0.0, torch.nan])}, r"'first\.bias' holds values that are not finite"),
+        (
+            {"first.bias": torch.zeros(2).half()},
+            r"'first\.bias' is float16; expected float32: converted weights",
+        ),
         ({"second.bias": torch.zeros(2)}, r"'second\.bias' is no part of ModuleDict"),
         ({"norm.running_var": None}, r"no 'norm\.running_var' in it"),
     ):

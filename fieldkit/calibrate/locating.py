@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fieldkit.calibrate.geometry import Bearings, Poses, bearings, project
 from fieldkit.calibrate.photos import Shot, describe_blur, read_photo
 from fieldkit.cameras import Camera
+from fieldkit.features import to_grey
 from fieldkit.frames import Pose
 from fieldkit.localize import Inliers, Localizer
 from fieldkit.protocol import LocalizerRules
@@ -58,12 +59,12 @@ def locate(
     for number, shot in enumerate(shots):
         if progress is not None:
             progress("localize photos", number + 1, len(shots))
-        photo, image = shot.photo, read_photo(shot.photo)
+        photo, image = shot.photo, read_photo(shot.photo, colour=localizer.colour)
         assert image is not None
         small, camera = _reduced(_without_tags(image, shot.found), photo.camera, finest_px)
         estimate, inliers = localizer.localize_with_inliers(small, camera)
         if estimate.map_from_cam is None or inliers is None:
-            reason = f"not localized ({estimate.status}, {estimate.n_inliers} inliers{describe_blur(image)})"
+            reason = f"not localized ({estimate.status}, {estimate.n_inliers} inliers{describe_blur(to_grey(image))})"
             failed += [TagPhoto(photo.file, d.id, used=False, reason=reason, visit=photo.visit) for d in shot.usable]
             continue
         landmark, seen = right_matches(inliers, camera, estimate.map_from_cam, scene_map)
@@ -106,7 +107,7 @@ def right_matches(
 
 
 def _without_tags(image: Image, detections: Sequence[TagDetection]) -> Image:
-    """Return the photo with its tags painted over, margin included.
+    """Return the photo, grey or RGB, with its tags painted over, margin included.
 
     A tag that hung elsewhere while mapping would otherwise pull the photo there.
     """
@@ -114,7 +115,7 @@ def _without_tags(image: Image, detections: Sequence[TagDetection]) -> Image:
     for d in detections:
         centre = d.corners_px.mean(axis=0)
         quad = np.round(centre + 1.3 * (d.corners_px - centre)).astype(np.int32)
-        cv2.fillConvexPoly(covered, quad, float(np.median(image)))
+        cv2.fillConvexPoly(covered, quad, np.atleast_1d(np.median(image, axis=(0, 1))).tolist())
     return covered
 
 

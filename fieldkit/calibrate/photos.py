@@ -172,9 +172,9 @@ def _check_once(folder: Path, listed: Sequence[Photo]) -> None:
         first[path] = photo.file
 
 
-def read_photo(photo: Photo) -> Image | None:
-    """Read a photo's stored pixels in grey, None where it is no image; raises TagError for another size."""
-    image = pictures.read_grey(photo.path)
+def read_photo(photo: Photo, *, colour: bool = False) -> Image | None:
+    """Read a photo's stored pixels, grey or RGB, None where it is no image; raises TagError for another size."""
+    image = pictures.read_pixels(photo.path, colour=colour)
     if image is not None:
         header = pictures.PhotoHeader(image.shape[1], image.shape[0])
         pictures.refuse_other_size(photo.path, header, (photo.camera.width, photo.camera.height), photo.camera_path)

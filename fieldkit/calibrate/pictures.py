@@ -200,19 +200,22 @@ def is_cut_short(path: Path) -> bool:
         return False
 
 
-def read_grey(path: Path) -> Image | None:
-    """Read the stored pixels of a photo as grey uint8[h, w], None where it is no image.
+def read_pixels(path: Path, *, colour: bool = False) -> Image | None:
+    """Read the stored pixels of a photo as grey uint8[h, w] or RGB uint8[h, w, 3], None where it is no image.
 
     EXIF's rotation is not applied. Of 16-bit pixels, linear or not, black stays and the brightest become white. A JPEG
     that is cut short counts as no image: decoders fill the rest with grey.
     """
     if is_cut_short(path):
         return None
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
+    kind = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
+    image = cv2.imread(str(path), kind | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None:
         return None
+    if colour:
+        image = np.ascontiguousarray(image[:, :, ::-1])
     if image.dtype == np.uint8:
         return np.asarray(image)
     white = max(float(np.quantile(image, WHITE_QUANTILE)), 1.0)
-    grey: Image = np.clip(np.round(image.astype(np.float32) * (255.0 / white)), 0, 255).astype(np.uint8)
-    return grey
+    scaled: Image = np.clip(np.round(image.astype(np.float32) * (255.0 / white)), 0, 255).astype(np.uint8)
+    return scaled

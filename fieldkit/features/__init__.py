@@ -71,7 +71,8 @@ class FeatureKind:
     and descriptors [n, width] of ``dtype``, strongest first; a network finds its weights there, see `find_weights`.
     The image is uint8[h, w], or RGB uint8[h, w, 3] where ``colour``. ``matching`` says whether the distance ratio of
     the two nearest separates right matches from wrong ones, or only mutual nearest neighbours do; such neighbours
-    need a cosine of at least ``min_cosine``. ``lightglue`` names the weights of a LightGlue for this feature.
+    need a cosine of at least ``min_cosine``. ``weights`` names those of the network, ``lightglue`` those of a LightGlue
+    for this feature.
     """
 
     load: Callable[[Path | None], Detect]
@@ -81,11 +82,12 @@ class FeatureKind:
     colour: bool = False
     min_cosine: float = -1.0
     lightglue: str | None = None
+    weights: str | None = None
 
 
 def _aliked(variant: aliked.AlikedVariant, *, lightglue: str | None = None) -> FeatureKind:
-    load = functools.partial(aliked.load_aliked, variant)
-    return FeatureKind(load, variant.width, "mutual", colour=True, min_cosine=0.6, lightglue=lightglue)
+    load, names = functools.partial(aliked.load_aliked, variant), (lightglue, variant.weights)
+    return FeatureKind(load, variant.width, "mutual", "float32", True, 0.6, *names)
 
 
 # Least similarities: ALIKED's by eight pairs of red kitchen frames (19 of 20 right matches pass, a third of the wrong
@@ -97,8 +99,8 @@ FEATURES: dict[str, FeatureKind] = {
     "aliked": _aliked(aliked.N16ROT, lightglue="lightglue-aliked"),
     "aliked_n16": _aliked(aliked.N16, lightglue="lightglue-aliked"),
     "aliked_t16": _aliked(aliked.T16),
-    "xfeat": FeatureKind(load_xfeat, 64, "mutual", colour=True, min_cosine=0.82),
-    "superpoint": FeatureKind(load_superpoint, 256, "mutual", min_cosine=0.755),
+    "xfeat": FeatureKind(load_xfeat, 64, "mutual", colour=True, min_cosine=0.82, weights="xfeat"),
+    "superpoint": FeatureKind(load_superpoint, 256, "mutual", min_cosine=0.755, weights="superpoint"),
 }
 
 # Other accepted names: COLMAP and hloc store RootSIFT as SIFT.

@@ -31,6 +31,7 @@ class AppearanceKind:
 
     ``load(folder)`` returns ``maps(image)``, which gives dense features f32[1, dense_width, h/stride, w/stride] of an
     image f32[1, 3, h, w] whose sides are multiples of ``side_px``, and its global feature f32[1, whole_width].
+    ``weights`` names the network's.
     """
 
     load: Callable[[Path | None], Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]]
@@ -38,6 +39,7 @@ class AppearanceKind:
     whole_width: int
     stride_px: int
     side_px: int
+    weights: str
 
 
 def _open_efficientnet(folder: Path | None) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
@@ -62,8 +64,11 @@ APPEARANCES: dict[str, AppearanceKind] = {
         efficientnet.WHOLE_WIDTH,
         efficientnet.DENSE_STRIDE_PX,
         2 * efficientnet.DENSE_STRIDE_PX,
+        "efficientnet-lite0",
     ),
-    "dinov2": AppearanceKind(_open_dinov2, dinov2.WIDTH, dinov2.WIDTH, dinov2.PATCH_PX, dinov2.PATCH_PX),
+    "dinov2": AppearanceKind(
+        _open_dinov2, dinov2.WIDTH, dinov2.WIDTH, dinov2.PATCH_PX, dinov2.PATCH_PX, "dinov2-vits14"
+    ),
 }
 
 

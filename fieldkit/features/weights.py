@@ -263,6 +263,12 @@ def fill_network(
             raise WeightsError(
                 f"{path}: {key!r} is {list(stored[key].shape)}; expected {list(tensor.shape)}", hint=hint
             )
+        if tensor.is_floating_point() and stored[key].dtype != tensor.dtype:
+            # They would be converted without a word, integers too
+            raise WeightsError(
+                f"{path}: {key!r} is {_kind(stored[key])}; expected {_kind(tensor)}: converted weights find others",
+                hint="take the published file",
+            )
         if not bool(torch.isfinite(stored[key]).all()):
             raise WeightsError(f"{path}: {key!r} holds values that are not finite", hint="download the file again")
     for key in stored:
@@ -270,3 +276,7 @@ def fill_network(
             raise WeightsError(f"{path}: {key!r} is no part of {type(network).__name__}", hint=hint)
     network.load_state_dict(stored, strict=False)
     network.eval()
+
+
+def _kind(tensor: torch.Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")

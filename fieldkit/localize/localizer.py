@@ -14,6 +14,7 @@ from fieldkit.cameras import Camera
 from fieldkit.errors import LocalizeError
 from fieldkit.features import Descriptors, open_extractor, working_factor
 from fieldkit.features.appearance import open_appearance
+from fieldkit.features.used import weight_files
 from fieldkit.frames import Pose, compose_covariance
 from fieldkit.localize.chance import Agreement, confidence
 from fieldkit.localize.matching import expected_noise, landmark_noise, open_matcher
@@ -22,6 +23,7 @@ from fieldkit.localize.parallel import default_threads, in_threads
 from fieldkit.localize.pose import PosedPoints, Solved, estimate_pose, residuals_px
 from fieldkit.localize.retrieval import build_index, most_similar, nearest_vectors
 from fieldkit.protocol import LocalizerRules
+from fieldkit.store import digest
 from fieldkit.store.inputs import RigCamera
 from fieldkit.types import Estimate, Image, SceneMap
 from fieldkit.warp import shared_errors
@@ -34,6 +36,8 @@ _MAX_KEYPOINTS = 2048
 _MAX_SIDE_PX = 1600
 # A pixel is undistorted rightly when its ray is seen this near to it again
 _SAME_PX = 0.1
+# At the rim of a fisheye's half space the plane has no end
+_MOST_STRETCH = 1000.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,11 +144,18 @@ class Localizer:
         stated = scene_map.retrieval
         self._appearance = None if stated is None else open_appearance(stated, weights=weights)
         self._shared = shared_errors(scene_map)
+        used = weight_files(scene_map.feature, matcher=self._rules.matcher, retrieval=stated, folder=weights)
+        self._weights = digest(*used) if used else ""
 
     @property
     def colour(self) -> bool:
         """Whether the map's feature or retrieval looks at colours: give it RGB images then."""
         return self._kind.colour or self._appearance is not None
+
+    @property
+    def weights_digest(self) -> str:
+        """The digest of the networks' weight files, empty without networks: other weights give other estimates."""
+        return self._weights
 
     def localize(self, image: Image, camera: Camera, *, prior: CameraPrior | None = None) -> Estimate:
         """Find map_from_cam of an image uint8[h, w] or RGB; a failure is an Estimate without a pose and its reason.
@@ -254,13 +265,16 @@ class Localizer:
         focal_px = np.asarray(camera.focal_px) * factor
         sigma_px = expected_noise(self._kind, features.scales[keypoint] * factor)
         grown = self._shared.sigma_px * landmark_noise(self._kind, sigma_px)
+        xy = camera.unproject(features.keypoints_px[keypoint])[:, :2]
+        stretch = undistortion_stretch(camera, xy)
         points = PosedPoints(
-            camera.unproject(features.keypoints_px[keypoint])[:, :2] * focal_px,
-            sigma_px,
+            xy * focal_px,
+            sigma_px if stretch is None else sigma_px * stretch,
             self._map.xyz[landmark],
             self._map.xyz_covariance[landmark] * grown[:, None, None] ** 2,
             (float(focal_px[0]), float(focal_px[1])),
             rig_from_cam,
+            stretch,
         )
         area_px = camera.width * camera.height * factor**2
         return _Matched(landmark, features.keypoints_px[keypoint], points, factor, area_px, len(features))
@@ -313,6 +327,24 @@ def _on_the_plane(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.boo
     again, inside = camera.project(camera.unproject(pixels))
     with np.errstate(invalid="ignore"):
         return np.asarray(inside & (np.linalg.norm(again - pixels, axis=1) < _SAME_PX))
+
+
+def undistortion_stretch(camera: Camera, xy: Array) -> Array | None:
+    """Return f64[n]: by how much undistorting magnifies the image at xy (n, 2); None where nothing is distorted.
+
+    It is the root mean square over directions: along the radius a fisheye is magnified more than across it.
+    """
+    if camera.is_pinhole:
+        return None
+    focal, step = np.asarray(camera.focal_px), 1e-6
+    columns = [
+        (camera.distort(xy + shift) - camera.distort(xy - shift)) * focal / (2 * step * focal[axis])
+        for axis, shift in enumerate(((step, 0.0), (0.0, step)))
+    ]
+    pixel_by_plane = np.stack(columns, axis=2)
+    size = np.sqrt(0.5 * (pixel_by_plane**2).sum(axis=(1, 2)))
+    # The inverse of a 2x2 matrix is as large as the matrix itself, over its determinant
+    return np.asarray(size / np.maximum(np.abs(np.linalg.det(pixel_by_plane)), size / _MOST_STRETCH))
 
 
 def _prior_of(map_from_rig: CameraPrior, rig_from_cam: Pose) -> CameraPrior:

@@ -28,6 +28,8 @@ _SCALE = 3.0
 _ITERATIONS = 20
 # Share of the variance that matches in one cell have in common: they lie on the same edges, lit and blurred alike
 _SHARED, _CELL_PX = 0.5, 16.0
+# Information that every pose has: what matches leave open has a standard deviation of 100 rad and 100 m, not none
+_UNKNOWN = 1e-4 * np.eye(6)
 # Median of chi-square with 2 degrees of freedom
 _MEDIAN_CHI2 = 2.0 * math.log(2.0)
 # Shares of the inlier bound at which RANSAC is started. Distant, nearly planar landmarks have two poses that agree
@@ -39,7 +41,7 @@ _STARTS = (1.0, 0.3, 0.12)
 class PosedPoints:
     """Matches of a camera: undistorted pixels from the principal point (n, 2), their expected noise per axis in px (n),
     landmarks (n, 3), their covariances (n, 3, 3), and the focal lengths in px; ``rig_from_cam`` where the camera is
-    one of a rig.
+    one of a rig. ``stretch`` (n): by how much undistorting magnified the image there, None without distortion.
     """
 
     pixels: Array
@@ -48,6 +50,7 @@ class PosedPoints:
     xyz_covariance: Array
     focal_px: tuple[float, float]
     rig_from_cam: Pose | None = None
+    stretch: Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +160,8 @@ def refine_pose(
     Every residual is whitened by its own 2x2 covariance: ``noise`` times the expected one plus the landmark's
     uncertainty projected into the image; those of ``scale`` standard deviations have half of the weight. The
     covariance is that of an M-estimator (Huber and Ronchetti, Robust Statistics, 7.6) whose noise is the residuals',
-    pooled with the expected; it takes the landmarks' errors as independent. The last is how the pose follows the
+    pooled with the expected; it takes the landmarks' errors as independent, and directions that the matches leave open
+    as unknown (100 rad, 100 m). The last is how the pose follows the
     landmarks.
     """
     stacked = _Stacked.of(cameras)
@@ -170,9 +174,9 @@ def refine_pose(
     variance = (0.5 * slope @ squared + EXPECTED_MATCHES) / (max(slope.sum() - 3.0, 0.0) + EXPECTED_MATCHES)
     weighted = slope[:, None, None] * by_pose
     alone = np.einsum("nai,naj->ij", weighted, by_pose)
-    inverse = np.linalg.pinv(alone, hermitian=True)
+    inverse = np.linalg.inv(alone + _UNKNOWN)
     response = -np.einsum("ij,njk->ink", inverse, np.einsum("naj,nak->njk", weighted, by_landmark))
-    spread = inverse @ ((1.0 - _SHARED) * alone + _SHARED * _crowded(stacked, weighted)) @ inverse
+    spread = inverse @ ((1.0 - _SHARED) * alone + _SHARED * _crowded(stacked, weighted) + _UNKNOWN) @ inverse
     return refined, 0.5 * variance * (spread + spread.T), response.reshape(6, -1)
 
 
@@ -293,10 +297,11 @@ def _inliers(cameras: Sequence[PosedPoints], map_from_rig: Pose, max_error_px: f
 
 
 def residuals_px(camera: PosedPoints, map_from_rig: Pose) -> Array:
-    """Return f64[n]: by how many pixels matches miss their landmarks; inf behind the camera."""
+    """Return f64[n]: by how many pixels of the image matches miss their landmarks; inf behind the camera."""
     x_in_cam = (map_from_rig * _from_rig(camera)).inv().apply(camera.xyz)
     depth = np.maximum(x_in_cam[:, 2:], MIN_DEPTH_M)
     missed = np.linalg.norm(x_in_cam[:, :2] / depth * camera.focal_px - camera.pixels, axis=1)
+    missed = missed if camera.stretch is None else missed / camera.stretch
     return np.where(x_in_cam[:, 2] > 0, missed, np.inf)
 
 
@@ -312,4 +317,5 @@ def subset(points: PosedPoints, rows: NDArray[np.bool_]) -> PosedPoints:
         sigma_px=points.sigma_px[rows],
         xyz=points.xyz[rows],
         xyz_covariance=points.xyz_covariance[rows],
+        stretch=None if points.stretch is None else points.stretch[rows],
     )

@@ -7,7 +7,7 @@ from fieldkit.maps.exchange.import_frame import FrameOptions
 from fieldkit.maps.exchange.importing import ImportOptions, import_map
 from fieldkit.maps.exchange.meshes import ForeignMesh
 from fieldkit.maps.gauge import Gauge, fit_gauge
-from fieldkit.maps.io import content_digest, load_map, map_info
+from fieldkit.maps.io import changed, content_digest, load_map, map_info
 from fieldkit.maps.landmarks import LandmarkRules
 from fieldkit.maps.options import MapOptions
 from fieldkit.warp import MapWarp, map_warp
@@ -23,6 +23,7 @@ __all__ = [
     "MapReport",
     "MapWarp",
     "build_map",
+    "changed",
     "compact_map",
     "content_digest",
     "export_map",

@@ -20,6 +20,7 @@ from fieldkit.errors import MapError, SurfaceError
 from fieldkit.features import Extractor, Features, feature_name, open_extractor
 from fieldkit.features.appearance import Appearance, open_appearance
 from fieldkit.features.matchers import PairMatcher, open_matcher
+from fieldkit.features.used import weight_files
 from fieldkit.frames import Pose
 from fieldkit.maps.io import (
     AlignmentEntry,
@@ -88,22 +89,15 @@ def build_map(
     ``progress(step, done, total)`` is called along the way. Raises MapError when the source is incomplete, too few
     images register, or nothing gives a metric frame, and StoreError when ``out`` is in the way; nothing is left behind.
     """
-    options, out = MapOptions() if options is None else options, Path(out)
+    options, out, feature = MapOptions() if options is None else options, Path(out), feature_name(feature)
     tell: Progress = progress or (lambda step, done, total: None)
-    feature = feature_name(feature)
     refuse_existing(out, force=force, marker="map.toml", kind="folder")
     walk = source if isinstance(source, MapSource) else open_source(Path(source))
     refuse_unscaled(walk, options)
     check_images(walk)
-    extractor = open_extractor(
-        feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
-    )
-    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
-    appearance = None if options.retrieval == "own" else open_appearance(options.retrieval, weights=options.weights)
+    extractor, matcher, appearance = _opened(feature, options)
     walk = without_poses(walk) if options.poses == "none" else walk
-    versions = library_versions()
-    key = digest(feature, repr(options), repr((seed, versions)), *_program(), *content(walk))
-    with resumed(out, key) as stages:
+    with resumed(out, _key(walk, feature, options, seed)) as stages:
         with stages.timed("tags") if options.tag_sizes_m else contextlib.nullcontext():
             tags = look_for_tags(walk, options, progress=tell)
         with stages.timed("extract"):
@@ -121,14 +115,30 @@ def build_map(
         told = (*walk.notes, *found.disbelieved, *placing.warnings, *left_out, *missing)
         with stages.timed("write"), atomic_folder(out, force=force, marker="map.toml") as folder:
             _write(folder, walk, model, features, mapped, surface)
-            if appearance is not None:
-                _write_global(folder, walk, mapped, appearance, options, tell)
+            _write_global(folder, walk, mapped, appearance, options, tell)
             made = content_digest(folder)
             places = alignment_entry(alignment), _surface_entry(surface, options)
             write_map_file(folder, MapFile(1, made, feature, *counts, *places))
-            if options.keep_record:
-                write_record(folder, dict(stages.seconds), versions=versions, options=repr(options), told=told)
+            _write_record(folder, stages, options, told)
     return MapReport(str(out), made, *counts, alignment, surface is not None, dict(stages.seconds), told)
+
+
+def _opened(feature: str, options: MapOptions) -> tuple[Extractor, PairMatcher, Appearance | None]:
+    """Open all networks before any work: weights that are missing are told at once."""
+    extractor = open_extractor(
+        feature, weights=options.weights, max_keypoints=options.max_keypoints, max_side_px=options.max_image_size
+    )
+    matcher = open_matcher(feature, options.matcher, ratio=options.ratio, weights=options.weights)
+    if options.retrieval == "own":
+        return extractor, matcher, None
+    return extractor, matcher, open_appearance(options.retrieval, weights=options.weights)
+
+
+def _key(walk: MapSource, feature: str, options: MapOptions, seed: int) -> str:
+    """Return the digest of all that a map is made of, by which a build knows its own stages."""
+    networks = weight_files(feature, matcher=options.matcher, retrieval=options.retrieval, folder=options.weights)
+    said = repr(options), repr((seed, library_versions()))
+    return digest(feature, *said, *networks, *_program(), *content(walk))
 
 
 def _program() -> list[Path]:
@@ -311,15 +321,23 @@ def _write_global(
     folder: Path,
     walk: MapSource,
     mapped: Mapping[int, Pose],
-    appearance: Appearance,
+    appearance: Appearance | None,
     options: MapOptions,
     tell: Progress,
 ) -> None:
+    if appearance is None:
+        return
     vectors = {}
     for done, i in enumerate(mapped, start=1):
         vectors[walk.images[i].name] = appearance.whole(read_image(walk.images[i], colour=True))
         tell("describe", done, len(mapped))
     write_global(folder / FILE, options.retrieval, vectors)
+
+
+def _write_record(folder: Path, stages: Stages, options: MapOptions, told: Sequence[str]) -> None:
+    if options.keep_record:
+        seconds, versions = dict(stages.seconds), library_versions()
+        write_record(folder, seconds, versions=versions, options=repr(options), told=told)
 
 
 def alignment_entry(a: Alignment) -> AlignmentEntry:

@@ -236,8 +236,12 @@ def _read_points(path: Path) -> tuple[NDArray[np.int64], Array]:
     ids = np.ascontiguousarray(heads[:, :8]).view("<i8").ravel()
     order = np.argsort(ids, kind="stable")
     xyz = np.ascontiguousarray(heads[:, 8:]).view("<f8")
-    if not np.isfinite(xyz).all():
-        raise ValueError("a point is not finite")
+    wrong = int((~np.isfinite(xyz).all(axis=1)).sum())
+    if wrong:
+        raise MapError(
+            f"{path}: {wrong} of {count} points are not finite; expected finite positions",
+            hint="copy or build the model again",
+        )
     return ids[order].astype(np.int64), xyz[order].astype(np.float64)
 
 

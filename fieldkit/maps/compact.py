@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,8 +33,24 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
     scene_map, entry = load_map(Path(path)), read_map_file(Path(path))
     if scene_map.descriptors.dtype != np.uint8:
         raise MapError(f"{path}: {scene_map.feature} descriptors are not 8-bit", hint="compact a map of feature sift")
-    kept = central_descriptors(scene_map)
-    keypoint, pixels, features = _features(scene_map, kept)
+    surface = None if scene_map.surface is None else coarsen(scene_map.surface, voxel_m=voxel_m)
+    with atomic_folder(Path(out), force=force, marker="map.toml") as folder:
+        _write_model(folder, scene_map)
+        if scene_map.retrieval is not None and scene_map.image_vectors is not None:
+            vectors = dict(zip(scene_map.image_names, scene_map.image_vectors, strict=True))
+            write_global(folder / FILE, scene_map.retrieval, vectors)
+        surface_entry = entry.surface
+        if surface is not None and surface_entry is not None:
+            write_ply(folder / "surface.ply", surface)
+            surface_entry = msgspec.structs.replace(surface_entry, voxel_m=surface.voxel_m, file="surface.ply")
+        write_map_file(
+            folder, msgspec.structs.replace(entry, version=1, digest=content_digest(folder), surface=surface_entry)
+        )
+
+
+def _write_model(folder: Path, scene_map: SceneMap) -> None:
+    """Write sparse/ and features.h5 with the keypoints that observe landmarks, and a descriptor of each landmark."""
+    keypoint, pixels, features = _features(scene_map, central_descriptors(scene_map))
     model = Model(
         scene_map.image_names,
         scene_map.image_cameras,
@@ -46,31 +63,9 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
         scene_map.observation_px,
     )
     sizes = {n: (c.width, c.height) for n, c in zip(scene_map.image_names, scene_map.image_cameras, strict=True)}
-    with atomic_folder(Path(out), force=force, marker="map.toml") as folder:
-        (folder / "sparse").mkdir()
-        model_from_arrays(model, pixels).write_binary(folder / "sparse")
-        write_features(folder / "features.h5", features, sizes, compress=True)
-        if scene_map.retrieval is not None and scene_map.image_vectors is not None:
-            vectors = dict(zip(scene_map.image_names, scene_map.image_vectors, strict=True))
-            write_global(folder / FILE, scene_map.retrieval, vectors)
-        surface_entry = entry.surface
-        if scene_map.surface is not None and surface_entry is not None:
-            surface = coarsen(scene_map.surface, voxel_m=voxel_m)
-            write_ply(folder / "surface.ply", surface)
-            surface_entry = type(surface_entry)(surface.voxel_m, surface_entry.truncation_m, "surface.ply")
-        write_map_file(
-            folder,
-            type(entry)(
-                version=1,
-                digest=content_digest(folder),
-                feature=entry.feature,
-                n_images=entry.n_images,
-                n_registered=entry.n_registered,
-                n_landmarks=entry.n_landmarks,
-                alignment=entry.alignment,
-                surface=surface_entry,
-            ),
-        )
+    (folder / "sparse").mkdir()
+    model_from_arrays(model, pixels).write_binary(folder / "sparse")
+    write_features(folder / "features.h5", features, sizes, compress=True)
 
 
 def central_descriptors(scene_map: SceneMap) -> NDArray[np.int64]:

@@ -199,6 +199,18 @@ def refuse_changed(path: Path, entry: MapFile) -> None:
         )
 
 
+def changed(path: Path) -> str | None:
+    """Return in one line what of a map's files is missing or not what map.toml says; None where nothing is.
+
+    Every file is read once, as it is for its digest.
+    """
+    try:
+        refuse_changed(Path(path), read_map_file(path))
+    except MapError as error:
+        return str(error)
+    return None
+
+
 def _read_surface(path: Path, entry: SurfaceEntry | None) -> Surface | None:
     """Return the surface; its voxel size is that of the digested mesh file, with which map.toml has to agree."""
     if entry is None:

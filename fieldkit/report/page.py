@@ -214,7 +214,8 @@ def _seconds_words(run: Run) -> str:
 def _localizer_words(run: Run) -> str:
     rules = run.protocol.localizer
     bounds = f"reprojection {rules.max_reprojection_px:g} px, at least {rules.min_inliers} inliers"
-    return f"{run.protocol.feature}, top {rules.top_k} retrieved, {bounds}, confidence {rules.min_confidence:g}"
+    named = f"feature {run.protocol.feature}, matcher {rules.matcher}"
+    return f"{named}, top {rules.top_k} retrieved, {bounds}, confidence {rules.min_confidence:g}"
 
 
 def _time_words(run: Run) -> str:

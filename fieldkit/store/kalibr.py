@@ -33,18 +33,21 @@ def read_kalibr(path: Path) -> tuple[KalibrCamera, ...]:
     """Read all cameras of a camchain.yaml; the rig is the IMU where the file says where that is, else cam0.
 
     Kalibr puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5): the principal point is converted.
-    Raises StoreError for another camera or distortion model than pinhole with radtan, equidistant or none.
+    Raises StoreError for another camera or distortion model than pinhole with radtan, equidistant or none, and where a
+    camera that places another one is missing.
     """
     try:
         values = YAML(typ="safe").load(read_text(path, what=_WHAT))
     except YAMLError as error:
         line = str(error).splitlines()[0]
         raise StoreError(f"{path}: not valid YAML: {line}; expected {_WHAT}", hint="correct the file") from error
-    names = [n for n in values if str(n).startswith("cam")] if isinstance(values, dict) else []
+    names = [n for n in values if isinstance(n, str) and n.startswith("cam")] if isinstance(values, dict) else []
     if not names or not all(isinstance(values[n], dict) for n in names):
         raise StoreError(f"{path}: no cam0 in it; expected {_WHAT}", hint="give Kalibr's camchain.yaml")
-    names.sort(key=lambda n: (len(str(n)), str(n)))
+    names.sort(key=lambda n: (int(n[3:]) if n[3:].isdigit() else -1, n))
     with_imu = all("T_cam_imu" in values[n] for n in names)
+    if not with_imu:
+        _refuse_gaps(path, {n: values[n] for n in names})
     result: list[KalibrCamera] = []
     for name in names:
         entry, place = values[name], f"{path}: {name}"
@@ -54,8 +57,29 @@ def read_kalibr(path: Path) -> tuple[KalibrCamera, ...]:
             rig_from_cam = Pose.identity()
         else:
             rig_from_cam = result[-1].rig_from_cam * _transform(entry, "T_cn_cnm1", place).inv()
-        result.append(KalibrCamera(str(name), _camera(entry, place), rig_from_cam))
+        result.append(KalibrCamera(name, _camera(entry, place), rig_from_cam))
     return tuple(result)
+
+
+def _refuse_gaps(path: Path, cameras: dict[str, Any]) -> None:
+    """Raise StoreError where a camera is placed by one that is not there: T_cn_cnm1 is of the camera before."""
+    names = list(cameras)
+    numbers = [int(n[3:]) if n[3:].isdigit() else None for n in names]
+    if len(names) > 1 and None in numbers:
+        raise StoreError(
+            f"{path}: has {', '.join(names)}; expected cam0, cam1, .., as T_cn_cnm1 is of the camera before",
+            hint="name the cameras by their order in the chain, or give every camera its T_cam_imu",
+        )
+    first = numbers[0] or 0
+    gaps = [first + k for k, number in enumerate(numbers) if number is not None and number != first + k]
+    if not gaps and first > 0 and "T_cn_cnm1" in cameras[names[0]]:
+        gaps = [first - 1]
+    if gaps:
+        raise StoreError(
+            f"{path}: has {', '.join(names)} but no cam{gaps[0]}; expected a chain without a gap, as T_cn_cnm1 is of "
+            "the camera before",
+            hint=f"add cam{gaps[0]}, or give every camera its T_cam_imu",
+        )
 
 
 def _camera(entry: dict[str, Any], place: str) -> Camera:

@@ -100,20 +100,12 @@ def import_map(
     found = read_model(folder)
     _refuse_useless(folder, found, images, options)
     alignment, warnings = metric_alignment(folder, found, images, options.frame, seed=seed, progress=tell)
-    model, n_points = _in_map(found, alignment.map_from_sfm), len(found.xyz)
+    model = _in_map(found, alignment.map_from_sfm)
     if options.retriangulate:
         assert images is not None
         rebuilt = _rebuilt(posed_walk(folder, model, images), out, options, force=force, seed=seed, progress=tell)
         return _judged(rebuilt, alignment, warnings)
-    good = good_landmarks(model, options.landmarks)
-    if not good.any():
-        rules = options.landmarks
-        raise MapError(
-            f"{folder}: none of {n_points} points is seen by {rules.min_images} images from "
-            f"{rules.min_distance_m:g}..{rules.max_distance_m:g} m",
-            hint="check the scale: --scale is metres per unit of the model",
-        )
-    model = keep_landmarks(model, good)
+    model = _landmarks_of(folder, model, options.landmarks)
     seconds["read"], start = time.perf_counter() - start, time.perf_counter()
     descriptors = _descriptors(model, images, options, tell)
     warnings += _described(folder, model, descriptors)
@@ -179,6 +171,18 @@ def _refuse_useless(folder: Path, model: Model, images: Path | None, options: Im
 def _in_map(model: Model, map_from_sfm: Similarity) -> Model:
     poses: tuple[Pose, ...] = tuple(map_from_sfm.pose(p) for p in model.map_from_image)
     return dataclasses.replace(model, xyz=map_from_sfm.points(model.xyz), map_from_image=poses)
+
+
+def _landmarks_of(folder: Path, model: Model, rules: LandmarkRules) -> Model:
+    """Keep the points that are landmarks; raises MapError when there is none."""
+    good = good_landmarks(model, rules)
+    if not good.any():
+        raise MapError(
+            f"{folder}: none of {len(model.xyz)} points is seen by {rules.min_images} images from "
+            f"{rules.min_distance_m:g}..{rules.max_distance_m:g} m",
+            hint="check the scale: --scale is metres per unit of the model",
+        )
+    return keep_landmarks(model, good)
 
 
 def keep_landmarks(model: Model, kept: NDArray[np.bool_]) -> Model:

@@ -29,6 +29,7 @@ _SURE = 0.005
 # Drift that bends the whole walk leaves small residuals: in rendered walks positions were off by up to three times what
 # their residuals tell (tests/bench/test_map_accuracy.py)
 _UNSEEN = 3.0
+_WRONG_RATIO = 1.2
 # Tilt between SLAM's up and the map's that is levelled; more means that one of the two is wrong.
 _MAX_LEVELLED_DEG = 5.0
 
@@ -81,8 +82,13 @@ class Alignment:
     match_share: float | None = None
 
 
-def doubted(alignment: Alignment) -> Alignment:
-    """Return an alignment that does not pass: two sources of its scale contradict each other."""
+def doubted(alignment: Alignment, ratio: float) -> Alignment:
+    """Return an alignment that does not pass: two sources of its scale contradict each other by a factor ``ratio``.
+
+    By more than a fifth it fails: no drift or calibration is off by that, but a unit or the size of a tag.
+    """
+    if max(ratio, 1.0 / ratio) > _WRONG_RATIO:
+        return dataclasses.replace(alignment, verdict="fail")
     return dataclasses.replace(alignment, verdict="warn") if alignment.verdict == "pass" else alignment
 
 

@@ -14,7 +14,7 @@ from fieldkit.errors import MapError
 from fieldkit.frames import Pose
 from fieldkit.maps.landmarks import Model, model_arrays
 from fieldkit.maps.metric.align import Alignment, Similarity, Verdict, align_to_slam, doubted
-from fieldkit.maps.metric.depth import DepthScale, depth_scale, rescaled, with_depth_scale
+from fieldkit.maps.metric.depth import MAX_CHANGE, DepthScale, depth_scale, rescaled, with_depth_scale
 from fieldkit.maps.metric.given import known_alignment
 from fieldkit.maps.metric.tagged import MIN_IMAGES, TagScale, find_tags, tag_scale
 from fieldkit.maps.metric.upright import Upright, find_upright, up_rotation
@@ -89,7 +89,8 @@ def find_frame(
     told += _doubts(alignment)
     centres = np.stack([sfm_poses[i].translation for i in posed]), np.stack([p.translation for p in posed.values()])
     if scale is not None:
-        return _scaled_by_tags(alignment, scale, centres, told)
+        by_tags = _scaled_by_tags(alignment, scale, centres, told)
+        return _beside_depth(walk, model, sfm_poses, by_tags, "tags", limit=MAX_CHANGE)
     if options.scale == "slam" or (options.scale == "auto" and walk.depth_camera is None):
         return alignment, told
     found = _depth_ratio(walk, model, sfm_poses, alignment.map_from_sfm)
@@ -159,7 +160,7 @@ def _scaled_by_tags(
             f"tags say that the SLAM poses are {100 * (1.0 / ratio - 1):+.1f} % off in scale: check the tags' size; "
             "the tags are believed"
         )
-        scaled = doubted(scaled)
+        scaled = doubted(scaled, ratio)
     verdict = worst(scaled.verdict, _scale_verdict(tags.sigma, tags.apart))
     return dataclasses.replace(scaled, source="tags", scale_sigma=tags.sigma, verdict=verdict), told
 
@@ -191,7 +192,8 @@ def _by_images(
         numbers = tags.n_used, tags.n_total, tags.rms_m, tags.p95_m
         verdict = worst(_scale_verdict(tags.sigma, tags.apart), _gravity_verdict(up))
         alignment = Alignment(scaled, "tags", *numbers, up.sigma_deg, 0.0, verdict, up.source, tags.sigma)
-        return alignment, told + _tag_doubts(tags)
+        by_tags = alignment, told + _tag_doubts(tags)
+        return _beside_depth(walk, model, sfm_poses, by_tags, "tags", limit=MAX_CHANGE)
     found = None
     # A depth camera beside the images sees landmarks under angles that depend on the scale
     for _ in range(4):
@@ -236,11 +238,25 @@ def _by_known(walk: MapSource, model: pycolmap.Reconstruction | Model, poses: Ma
             f"known poses, verdict {alignment.verdict}: {alignment.n_used} of {alignment.n_total} images see points, "
             f"{100 * share:.0f} % of the matches fit, up is {tilt:.1f} +- {up.sigma_deg:.1f} deg off z in the images"
         )
-    found = _depth_ratio(walk, model, poses, alignment.map_from_sfm)
-    if found is not None and abs(found.ratio - 1.0) > max(0.02, 4.0 * found.sigma):
-        told.append(f"depth images say that the known poses are {100 * (1.0 / found.ratio - 1):+.1f} % off in scale")
-        alignment = doubted(alignment)
-    return alignment, told
+    return _beside_depth(walk, model, poses, (alignment, told), "known poses", limit=0.02)
+
+
+def _beside_depth(
+    walk: MapSource,
+    model: pycolmap.Reconstruction | Model,
+    poses: Mapping[int, Pose],
+    found: Told,
+    what: str,
+    *,
+    limit: float,
+) -> Told:
+    """Doubt a scale that depth images, where there are any, contradict by more than ``limit``; it is kept."""
+    alignment, told = found
+    depth = _depth_ratio(walk, model, poses, alignment.map_from_sfm)
+    if depth is None or abs(depth.ratio - 1.0) <= max(limit, 4.0 * depth.sigma):
+        return found
+    off = f"depth images say that the {what} are {100 * (1.0 / depth.ratio - 1):+.1f} % off in scale"
+    return doubted(alignment, depth.ratio), [*told, off]
 
 
 def _depth_ratio(

@@ -19,7 +19,8 @@ Array = NDArray[np.float64]
 ReadDepth = Callable[[DepthFrame], NDArray[np.uint16]]
 
 _MIN_SAMPLES, _MIN_OF_FRAME = 200, 20
-_MAX_CHANGE = 0.05
+# A scale that depth changes by more contradicts it: depth cameras are a per cent or two off by calibration
+MAX_CHANGE = 0.05
 _RANGE_M = (0.4, 5.0)
 # Depth may change this much around a landmark; more is an edge, where landmark and pixel may lie on two surfaces.
 _FLAT = 0.02
@@ -109,13 +110,13 @@ def with_depth_scale(
     frame and gravity stay SLAM's, and the residuals are those to its positions after scaling.
     """
     told = []
-    if abs(found.ratio - 1.0) > _MAX_CHANGE:
+    if abs(found.ratio - 1.0) > MAX_CHANGE:
         told = [
             f"depth images say that the SLAM poses are {100 * (1.0 / found.ratio - 1):+.1f} % off in scale "
             f"({found.n} landmarks); {'depth is' if anyway else 'the poses are'} believed: check the units and the "
             "calibration of both"
         ]
-        alignment = doubted(alignment)
+        alignment = doubted(alignment, found.ratio)
         if not anyway:
             return alignment, told
     scaled = rescaled(alignment, found.ratio, sfm_centres=sfm_centres, slam_centres=slam_centres)

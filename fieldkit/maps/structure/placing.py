@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from fieldkit.maps.metric.align import Alignment
 from fieldkit.maps.metric.choosing import find_frame
 from fieldkit.maps.options import MapOptions, Progress, SlamRules
 from fieldkit.maps.quiet import quiet_colmap
-from fieldkit.maps.sources.source import MapSource
+from fieldkit.maps.sources.source import MIN_POSES, MapSource
 from fieldkit.maps.stages import Stages
 from fieldkit.maps.structure.known import match_share, triangulate
 from fieldkit.maps.structure.pairs import Pair
@@ -181,11 +181,28 @@ def _registered(
             if others
             else "map in one connected walk with overlapping sharp images; check images and cameras of the others",
         )
+    _refuse_unposed(walk, poses, others)
     missing = [i for i in range(len(walk.images)) if i not in poses]
     if not missing:
         return poses, []
     told = f"{len(poses)} of {len(walk.images)} images registered, without {_named(walk, missing)}{apart}"
     return poses, [f"{told}: add images between the pieces, or map each by itself" if others else told]
+
+
+def _refuse_unposed(walk: MapSource, placed: Collection[int], others: Sequence[Sequence[int]]) -> None:
+    """Raise MapError where SLAM's poses are of a piece that the largest one is not connected with."""
+
+    def posed(piece: Iterable[int]) -> list[int]:
+        return [i for i in piece if walk.images[i].slam_from_cam is not None]
+
+    best = max(others, key=lambda piece: len(posed(piece)), default=[])
+    if walk.n_posed < MIN_POSES or len(posed(placed)) >= MIN_POSES or len(posed(best)) < MIN_POSES:
+        return
+    raise MapError(
+        f"{walk.path}: the images are in pieces: {len(posed(placed))} of the {len(placed)} in the largest have a SLAM "
+        f"pose, but {len(posed(best))} of {len(best)} others ({_named(walk, best)}); expected poses in the largest",
+        hint="map the piece with poses by itself, add images between the pieces, or give the largest its poses, too",
+    )
 
 
 def _named(walk: MapSource, chosen: Sequence[int]) -> str:

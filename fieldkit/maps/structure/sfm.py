@@ -138,11 +138,12 @@ def reconstruct(
     """Reconstruct cameras and points from a verified database: models in SfM's own scale and frame, largest first.
 
     Intrinsics and the geometry of a rig stay fixed: a rig's images are placed together, and in metres. More than one
-    model grows where the images show places that nothing connects. Raises MapError when no pair of images is verified
-    or no model grows.
+    model grows where the images show places that nothing connects. ``progress`` counts what is placed together: images
+    of one camera, frames of a rig. Raises MapError when no pair of images is verified or no model grows.
     """
     with contextlib.closing(pycolmap.Database.open(database)) as content:
         n_pairs, n_verified = content.num_matched_image_pairs(), content.num_verified_image_pairs()
+        n_frames = content.num_frames()
     if not n_verified:
         raise MapError(
             f"no pair of the {len(images)} images shows the same place ({n_pairs} pairs with matches)",
@@ -154,9 +155,9 @@ def reconstruct(
         def count() -> None:
             nonlocal done
             done += 1
-            progress("reconstruct", min(done + 2, len(images)), len(images))
+            progress("reconstruct", min(done + 2, n_frames), n_frames)
 
-        progress("reconstruct", 0, len(images))
+        progress("reconstruct", 0, n_frames)
         models = pycolmap.incremental_mapping(
             database, folder, Path(folder) / "models", options=mapping_options(seed), next_image_callback=count
         )
