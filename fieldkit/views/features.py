@@ -157,7 +157,7 @@ def landmark_tokens(
     tokens[:, 5] = statistics.max_angle_rad[i] / np.pi
     tokens[:, 6] = seen.off_mean_rad / np.pi
     tokens[:, 7:9] = seen.uv_px / (camera.width, camera.height)
-    tokens[:, 9:TOKEN_WIDTH] = _log_share(heat_maps.counts(i).reshape(len(i), -1), FULL_OBSERVATIONS)
+    tokens[:, 9:TOKEN_WIDTH] = _log_share(heat_maps.counts(i).reshape(len(i), HEAT_CELLS**2), FULL_OBSERVATIONS)
     if appearance is not None:
         tokens[:, TOKEN_WIDTH:] = appearance[i]
     return np.clip(tokens, 0.0, 1.0, out=tokens)
