@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.policies.scene import Scene
+from fieldkit.views import ANGLE_SLACK_RAD
 
 Array = NDArray[np.float64]
-# A direction exactly on the border of the mapped range counts, whatever the last bits of its angle are.
-ANGLE_SLACK_RAD = 1e-6
 
 
 def most_visible(scene: Scene) -> Array:
