@@ -1,0 +1,237 @@
+"""The views of datasets as what a network is trained on: what each sees, and whether it localizes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit import maps
+from fieldkit.cameras import Camera
+from fieldkit.errors import DatasetError, TrainingError, suggestion
+from fieldkit.store.datasets import (
+    DatasetRules,
+    SceneFile,
+    Shard,
+    map_path,
+    read_dataset,
+    read_scene,
+    read_scene_shard,
+    scene_path,
+    shard_path,
+)
+from fieldkit.types import LandmarkStatistics, SceneMap
+from fieldkit.views import HeatMaps, SeenLandmarks, landmark_statistics, seen_in_shard
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneFolder:
+    """A finished scene of a dataset on disk."""
+
+    folder: Path
+    entry: SceneFile
+    rules: DatasetRules
+
+    @property
+    def name(self) -> str:
+        return self.entry.name
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Examples:
+    """The candidate views (v) of one scene, in the order of its waypoints.
+
+    ``label`` bool[v]: the view localized; ``waypoint`` int32[v] its number. ``rows``: views i sees, of the k landmarks
+    in view, ``starts[i]:starts[i + 1]``; ``seen`` holds all k one after the other, ``occluded`` bool[k].
+    """
+
+    scene: str
+    map_digest: str
+    camera: Camera
+    statistics: LandmarkStatistics
+    heat_maps: HeatMaps
+    label: NDArray[np.bool_]
+    waypoint: NDArray[np.int32]
+    starts: NDArray[np.int64]
+    seen: SeenLandmarks
+    occluded: NDArray[np.bool_]
+
+    def view(self, number: int, *, occlusion: bool) -> SeenLandmarks:
+        """Return what a view sees; with ``occlusion`` without the landmarks behind the surface."""
+        rows = slice(int(self.starts[number]), int(self.starts[number + 1]))
+        part = [getattr(self.seen, f.name)[rows] for f in dataclasses.fields(self.seen)]
+        if occlusion:
+            free = ~self.occluded[rows]
+            part = [values[free] for values in part]
+        return SeenLandmarks(*part)
+
+
+def find_scenes(datasets: Sequence[Path]) -> tuple[SceneFolder, ...]:
+    """Return the scenes of dataset folders, in order, without reading their views.
+
+    Raises DatasetError for a dataset that is not finished, holds a scene twice, or was localized otherwise than the
+    first one: features and labels of two features or localizers do not mix.
+    """
+    found: list[SceneFolder] = []
+    for path in (Path(d) for d in datasets):
+        head = read_dataset(path)
+        for name in head.scenes:
+            found.append(SceneFolder(path, _finished(path, name), head.rules))
+        _refuse_other(path, head.rules, found[0])
+    names = [s.name for s in found]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise DatasetError(
+            f"{', '.join(str(d) for d in datasets)}: hold the scene {twice!r} twice; expected it once",
+            hint="leave one of the datasets away",
+        )
+    return tuple(found)
+
+
+def _finished(path: Path, name: str) -> SceneFile:
+    if not scene_path(path, name).is_file():
+        raise DatasetError(f"{path}: has no views of the scene {name!r} yet", hint="finish the dataset first")
+    entry = read_scene(path, name)
+    missing = [w for w in entry.waypoints if not shard_path(path, name, w).is_file()]
+    if missing:
+        raise DatasetError(
+            f"{path}: {len(missing)} of {len(entry.waypoints)} waypoints of {name!r} are missing, {missing[0]} first; "
+            "expected all",
+            hint="finish the dataset first",
+        )
+    return entry
+
+
+def _refuse_other(path: Path, rules: DatasetRules, first: SceneFolder) -> None:
+    for what in ("feature", "localizer", "candidates", "tolerance_voxels", "label"):
+        own, other = getattr(rules, what), getattr(first.rules, what)
+        if own != other:
+            raise DatasetError(
+                f"{path}: was made with {what} {own!r}, {first.folder} with {other!r}; expected the same",
+                hint="train from datasets that were made with the same settings",
+            )
+
+
+def read_examples(scene: SceneFolder, *, progress: Progress | None = None) -> Examples:
+    """Read the views of a scene of a dataset, and how mapping saw their landmarks.
+
+    Raises StoreError or MapError where a file is damaged, and DatasetError where the map is another than the one in
+    which the views were localized.
+    """
+    scene_map = maps.load_map(map_path(scene.folder, scene.entry))
+    if scene_map.digest != scene.entry.map_digest:
+        raise DatasetError(
+            f"{scene_map.path}: has the digest {scene_map.digest[:12]}; expected {scene.entry.map_digest[:12]}, the "
+            f"one that {scene.name} was localized in",
+            hint="make the dataset again",
+        )
+    statistics = landmark_statistics(scene_map)
+    labels: list[NDArray[np.bool_]] = []
+    waypoints: list[NDArray[np.int32]] = []
+    parts: list[_Part] = []
+    camera: Camera | None = None
+    for number, waypoint in enumerate(scene.entry.waypoints):
+        shard = read_scene_shard(scene.folder, scene.entry, waypoint)
+        views = np.array([i for i, k in enumerate(shard.kinds) if k in scene.rules.candidates.kinds], dtype=np.int64)
+        labels.append(shard.label[views])
+        waypoints.append(np.full(len(views), number, dtype=np.int32))
+        parts += [_seen(shard, int(i), scene_map, statistics) for i in views]
+        camera = shard.camera if camera is None else _same(camera, shard, scene)
+        if progress is not None:
+            progress(f"read {scene.name}", number + 1, len(scene.entry.waypoints))
+    assert camera is not None, "a scene has a waypoint"
+    counts = [len(p.occluded) for p in parts]
+    return Examples(
+        scene=scene.name,
+        map_digest=scene_map.digest,
+        camera=camera,
+        statistics=statistics,
+        heat_maps=HeatMaps(scene_map),
+        label=np.concatenate(labels),
+        waypoint=np.concatenate(waypoints),
+        starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        seen=_joined([p.seen for p in parts]),
+        occluded=np.concatenate([p.occluded for p in parts]) if parts else np.zeros(0, dtype=bool),
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Part:
+    seen: SeenLandmarks
+    occluded: NDArray[np.bool_]
+
+
+def _seen(shard: Shard, view: int, scene_map: SceneMap, statistics: LandmarkStatistics) -> _Part:
+    seen = seen_in_shard(shard, view, xyz=scene_map.xyz, statistics=statistics, occlusion=False)
+    return _Part(seen, shard.occluded[shard.starts[view] : shard.starts[view + 1]])
+
+
+def _same(camera: Camera, shard: Shard, scene: SceneFolder) -> Camera:
+    if shard.camera != camera:
+        raise DatasetError(
+            f"{scene.folder}: {scene.name}/{shard.waypoint} has another camera than the waypoints before; expected one",
+            hint="make a dataset per camera",
+        )
+    return camera
+
+
+def _joined(parts: Sequence[SeenLandmarks]) -> SeenLandmarks:
+    fields = [f.name for f in dataclasses.fields(SeenLandmarks)]
+    return SeenLandmarks(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
+
+
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """Scenes to train on, and the one on which every choice is made."""
+
+    training: tuple[SceneFolder, ...]
+    validation: SceneFolder
+
+
+def split_scenes(
+    scenes: Sequence[SceneFolder], *, validate: str | None = None, tests: Sequence[Path] = ()
+) -> Split:
+    """Split scenes into those to train on and one to validate on: never by view, and never a view in both.
+
+    Without a name the last scene in alphabetical order is the one to validate on. Raises TrainingError when there is
+    no such scene or no other, when two scenes are the same place, or one is in a dataset that is kept for ``tests``.
+    """
+    names = [s.name for s in scenes]
+    if len(names) < 2:
+        raise TrainingError(
+            f"{len(names)} scene to train and validate on ({', '.join(names)}); expected at least two",
+            hint="give a dataset of more scenes, or more datasets",
+        )
+    chosen = max(names) if validate is None else validate
+    if chosen not in names:
+        raise TrainingError(f"no scene {chosen!r} to validate on", hint=suggestion(chosen, names))
+    for number, scene in enumerate(scenes):
+        _refuse_same_place(scene, scenes[:number])
+        _refuse_tested(scene, tests)
+    return Split(tuple(s for s in scenes if s.name != chosen), next(s for s in scenes if s.name == chosen))
+
+
+def _refuse_same_place(scene: SceneFolder, others: Sequence[SceneFolder]) -> None:
+    for other in others:
+        if scene.entry.map_digest == other.entry.map_digest:
+            raise TrainingError(
+                f"scenes {other.name!r} of {other.folder} and {scene.name!r} of {scene.folder} have the same map; "
+                "expected different places, or training and validation would share views",
+                hint="leave one of them away",
+            )
+
+
+def _refuse_tested(scene: SceneFolder, tests: Sequence[Path]) -> None:
+    for path in tests:
+        names = read_dataset(path).scenes
+        maps_there = {read_scene(path, n).map_digest for n in names if scene_path(path, n).is_file()}
+        if scene.name in names or scene.entry.map_digest in maps_there:
+            raise TrainingError(
+                f"{scene.folder}: its scene {scene.name!r} is one of the test scenes in {path}; expected others",
+                hint="train and validate on scenes that no test will see",
+            )

@@ -1,0 +1,109 @@
+"""Batches of views as what a network takes, with the changes that keep it from learning the scenes by heart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.learned.batches import padded
+from fieldkit.training.examples import Examples, Progress
+from fieldkit.training.rules import TrainingRules
+from fieldkit.views import HISTOGRAM_WIDTH, TOKEN_WIDTH, SeenLandmarks, landmark_tokens, thinned, view_histograms
+
+Floats = NDArray[np.float32]
+Arrays = tuple[NDArray[np.generic], ...]
+# In training, by how much (1 sigma) a landmark's distances are off, relatively, and its angles and image position, as
+# shares of pi and of the image: where mapping saw it otherwise names the landmark, and with it the scene's views.
+_DISTANCE_JITTER, _PLACE_JITTER = 0.1, 0.02
+_DISTANCES, _PLACES = slice(0, 3), slice(3, 9)
+
+
+class Inputs(Protocol):
+    """Views of several scenes by one number, and their labels bool[v]."""
+
+    label: NDArray[np.bool_]
+
+    def plain(self, views: NDArray[np.int64], *, occlusion: bool) -> Arrays:
+        """Return the network's inputs for views as they are scored."""
+
+    def varied(self, views: NDArray[np.int64], occlusion: NDArray[np.bool_], rng: np.random.Generator) -> Arrays:
+        """Return the network's inputs for views as it learns them."""
+
+
+class HistogramInputs:
+    """Histograms f32[v, 146], computed once with and without the landmarks behind the surface."""
+
+    def __init__(self, scenes: Sequence[Examples], *, progress: Progress | None = None) -> None:
+        self.label = np.concatenate([s.label for s in scenes])
+        self._histograms = {
+            use: np.concatenate([_histograms(s, occlusion=use, progress=progress) for s in scenes])
+            for use in (False, True)
+        }
+
+    def plain(self, views: NDArray[np.int64], *, occlusion: bool) -> Arrays:
+        """Return histograms f32[b, 146]."""
+        return (self._histograms[occlusion][views],)
+
+    def varied(self, views: NDArray[np.int64], occlusion: NDArray[np.bool_], rng: np.random.Generator) -> Arrays:
+        """Return histograms f32[b, 146], each with or without the landmarks behind the surface."""
+        return (np.where(occlusion[:, None], self._histograms[True][views], self._histograms[False][views]),)
+
+
+def _histograms(scene: Examples, *, occlusion: bool, progress: Progress | None) -> Floats:
+    rows = np.zeros((len(scene.label), HISTOGRAM_WIDTH), dtype=np.float32)
+    for i in range(len(rows)):
+        rows[i] = view_histograms(scene.view(i, occlusion=occlusion), scene.statistics, camera=scene.camera)
+        if progress is not None and (i + 1 == len(rows) or i % 100 == 99):
+            progress(f"histograms of {scene.scene}{', occlusion filter' if occlusion else ''}", i + 1, len(rows))
+    return rows
+
+
+class TokenInputs:
+    """Tokens of the landmarks of views, at most ``cap`` a view: others each time in training, the same in scoring."""
+
+    def __init__(self, scenes: Sequence[Examples], rules: TrainingRules, *, appearance: Sequence[Floats] = ()) -> None:
+        assert rules.cap is not None, "a model of landmarks has a cap"
+        self.label = np.concatenate([s.label for s in scenes])
+        self._scenes, self._rules, self._appearance = scenes, rules, appearance
+        self._scene = np.repeat(np.arange(len(scenes)), [len(s.label) for s in scenes])
+        self._first = np.cumsum([0, *(len(s.label) for s in scenes)])
+
+    @property
+    def width(self) -> int:
+        """How many numbers a token has."""
+        return TOKEN_WIDTH + (self._appearance[0].shape[1] if self._appearance else 0)
+
+    def plain(self, views: NDArray[np.int64], *, occlusion: bool) -> Arrays:
+        """Return tokens f32[b, n, width] and bool[b, n], which of them are landmarks."""
+        return padded([self._tokens(v, occlusion=occlusion, seed=0) for v in views], width=self.width)
+
+    def varied(self, views: NDArray[np.int64], occlusion: NDArray[np.bool_], rng: np.random.Generator) -> Arrays:
+        """Return tokens f32[b, n, width] and bool[b, n]: with jitter, and every second batch seen in a mirror."""
+        seed = int(rng.integers(2**31))
+        found = [self._tokens(v, occlusion=bool(o), seed=seed) for v, o in zip(views, occlusion, strict=True)]
+        tokens, there = padded(found, width=self.width)
+        size = (*tokens.shape[:2], TOKEN_WIDTH)
+        noise = rng.standard_normal((*size[:2], _PLACES.stop), dtype=np.float32) * np.float32(self._rules.jitter)
+        tokens[..., _DISTANCES] *= np.exp(_DISTANCE_JITTER * noise[..., _DISTANCES])
+        tokens[..., _PLACES] += _PLACE_JITTER * noise[..., _PLACES]
+        if rng.random() < 0.5:
+            _mirror(tokens)
+        np.clip(tokens, 0.0, 1.0, out=tokens)
+        tokens[~there] = 0.0
+        return tokens, there
+
+    def _tokens(self, view: np.int64, *, occlusion: bool, seed: int) -> Floats:
+        number = int(self._scene[view])
+        scene = self._scenes[number]
+        assert self._rules.cap is not None
+        seen = scene.view(int(view - self._first[number]), occlusion=occlusion)
+        return landmark_tokens(
+            thinned(seen, cap=self._rules.cap, seed=seed),
+            scene.statistics,
+            heat_maps=scene.heat_maps,
+            camera=scene.camera,
+            appearance=self._appearance[number] if self._appearance else None,
+        )

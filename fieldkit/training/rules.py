@@ -1,0 +1,55 @@
+"""What training can be told."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+from fieldkit.errors import TrainingError
+
+ModelName = Literal["mlp", "vpt", "vpt_appearance"]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingRules:
+    """Settings of a training; those that the defaults leave open depend on the model (`settled`).
+
+    ``epochs`` passes over the training views at most, and ``patience`` of them without a better choice of views in
+    the validation scene end it early. Every step takes ``batch`` views; the learning rate rises to ``learning_rate``
+    and falls as a cosine. ``occluded`` is the share of the views that are shown without the landmarks behind the
+    surface, the others with all: one network serves both. ``cap``: landmarks of a view that are looked at, at most.
+    ``smoothing`` of the labels, and ``jitter``: see `fieldkit.training.inputs`. Raises TrainingError where a value
+    cannot be used.
+    """
+
+    model: ModelName = "vpt"
+    seed: int = 0
+    epochs: int | None = None
+    patience: int = 8
+    batch: int = 64
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.01
+    cap: int | None = None
+    occluded: float = 0.7
+    jitter: float = 1.0
+
+    def __post_init__(self) -> None:
+        counts = {"epochs": self.epochs, "patience": self.patience, "batch": self.batch, "cap": self.cap}
+        for name, value in counts.items():
+            if value is not None and value < (2 if name == "batch" else 1):
+                raise TrainingError(f"{name} is {value}; expected a positive number", hint=f"choose another {name}")
+        if not 0 <= self.seed < 2**31:
+            raise TrainingError(f"seed is {self.seed}; expected 0..{2**31 - 1}", hint="choose another seed")
+        for name, value in {"learning_rate": self.learning_rate, "weight_decay": self.weight_decay}.items():
+            if not (math.isfinite(value) and value >= 0):
+                raise TrainingError(f"{name} is {value:g}; expected 0 or more", hint=f"choose another {name}")
+        if not 0 <= self.occluded <= 1:
+            raise TrainingError(f"occluded is {self.occluded:g}; expected a share", hint="choose 0..1")
+
+    def settled(self) -> TrainingRules:
+        """Return the rules with what was left open filled in."""
+        mlp = self.model == "mlp"
+        epochs = self.epochs if self.epochs is not None else (15 if mlp else 12)
+        cap = None if mlp else (self.cap if self.cap is not None else 256)
+        return dataclasses.replace(self, epochs=epochs, cap=cap)
