@@ -30,11 +30,23 @@ FULL_DISTANCE_M = 5.0
 # hundred. Images that saw a landmark in a cell, and landmarks of a view.
 FULL_OBSERVATIONS, FULL_LANDMARKS = 32, 4096
 # Angles to the principal axis beyond this (corners of a wide mapping camera) share the last bin.
-FULL_ANGLE_RAD = np.radians(60.0)
+FULL_ANGLE_DEG = 60.0
 # Bins of how far outside the mapped range a landmark is seen; those inside it are in the middle of the fifth.
-OUTSIDE_BIN_M, OUTSIDE_BIN_RAD, _INSIDE_BIN = 0.5, np.radians(6.0), 4.5
+OUTSIDE_BIN_M, OUTSIDE_BIN_DEG, _INSIDE_BIN = 0.5, 6.0, 4.5
 # A direction exactly on the border of the mapped range counts, whatever the last bits of its angle are.
 ANGLE_SLACK_RAD = 1e-6
+
+
+def normalisation() -> dict[str, float]:
+    """Return the constants of the features by name: a network only understands those that it was trained with."""
+    return {
+        "full_distance_m": FULL_DISTANCE_M,
+        "full_observations": FULL_OBSERVATIONS,
+        "full_landmarks": FULL_LANDMARKS,
+        "full_angle_deg": FULL_ANGLE_DEG,
+        "outside_bin_m": OUTSIDE_BIN_M,
+        "outside_bin_deg": OUTSIDE_BIN_DEG,
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,10 +175,10 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
     places = [
         BINS * nearest / FULL_DISTANCE_M,
         BINS * farthest / FULL_DISTANCE_M,
-        BINS * least / FULL_ANGLE_RAD,
-        BINS * most / FULL_ANGLE_RAD,
+        BINS * least / np.radians(FULL_ANGLE_DEG),
+        BINS * most / np.radians(FULL_ANGLE_DEG),
         _INSIDE_BIN + _outside(seen.distance_m, nearest, farthest) / OUTSIDE_BIN_M,
-        _INSIDE_BIN + _outside(seen.angle_rad, least, most) / OUTSIDE_BIN_RAD,
+        _INSIDE_BIN + _outside(seen.angle_rad, least, most) / np.radians(OUTSIDE_BIN_DEG),
         line * cells + column,
         BINS * u,
         BINS * v,
