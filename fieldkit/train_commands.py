@@ -64,7 +64,9 @@ def train(
     if json:
         print_json(dataclasses.asdict(report) | {"path": str(report.path), "card": str(report.card)})
         return
-    table = make_table("occlusion", "chosen", "most visible", "possible", "Brier", title=f"validation: {report.validation}")
+    table = make_table(
+        "occlusion", "chosen", "most visible", "possible", "Brier", title=f"validation: {report.validation}"
+    )
     for verdict in report.verdicts:
         shares = (verdict.chosen, verdict.most_visible, verdict.possible)
         brier = f"{verdict.reliability.brier:.4f}"

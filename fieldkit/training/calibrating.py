@@ -43,6 +43,7 @@ def fit_calibration(log_odds: Array, label: Labels) -> Calibration:
     A bias is needed beside the temperature where classes were balanced in training: then log-odds are off by a
     constant.
     """
+
     def cost(x: Array) -> float:
         return log_loss(np.exp(x[0]) * log_odds + x[1], label)
 
@@ -64,7 +65,7 @@ class Reliability:
 
 
 def reliability(said: Array, label: Labels, *, bins: int = 10) -> Reliability:
-    """Hold probabilities f64[v] against labels: Brier score (and that of saying the mean rate), and bins of width 0.1."""
+    """Hold probabilities f64[v] against labels: Brier score, and that of always saying the mean rate; bins."""
     place = np.clip((said * bins).astype(np.int64), 0, bins - 1)
     views = np.bincount(place, minlength=bins)
     there = np.maximum(views, 1)

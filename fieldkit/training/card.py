@@ -72,18 +72,16 @@ Scores a candidate view by the probability that it localizes: policy `{about.kin
 {_SEES[about.kind]}, computed from the map and the candidate's pose alone.
 
 - local feature of the maps: {about.feature}
-- landmarks of a view that are looked at: {'all' if about.landmark_cap is None else f'at most {about.landmark_cap}'}
-- appearance: {about.appearance or 'none'}
+- landmarks of a view that are looked at: {"all" if about.landmark_cap is None else f"at most {about.landmark_cap}"}
+- appearance: {about.appearance or "none"}
 - seed {about.seed}, data {about.dataset_digest[:16]}
-- versions: {', '.join(f'{name} {version}' for name, version in about.versions.items())}
+- versions: {", ".join(f"{name} {version}" for name, version in about.versions.items())}
 """
 
 
 def _data(scenes: Sequence[SceneCount]) -> str:
     rows = [f"| {s.name} | {s.use} | {s.views} | {100 * s.localized:.1f} |" for s in scenes]
-    return "\n".join(
-        ["## Data", "", "| scene | use | views | % that localize |", "|---|---|---|---|", *rows, ""]
-    )
+    return "\n".join(["## Data", "", "| scene | use | views | % that localize |", "|---|---|---|---|", *rows, ""])
 
 
 def _settings(rules: TrainingRules, history: Sequence[Epoch]) -> str:
@@ -95,8 +93,8 @@ def _settings(rules: TrainingRules, history: Sequence[Epoch]) -> str:
         [
             "## Training",
             "",
-            f"Settings: {settings}. Classes weigh the same. Kept: the epoch with the best choices in the validation",
-            "scene (the best of half of a waypoint's candidates localizes, mean over both uses of the occlusion filter).",
+            f"Settings: {settings}. Classes weigh the same. Kept: the epoch with the best choices in the",
+            "validation scene (the best of half of a waypoint's candidates localizes; with and without the filter).",
             "",
             "| epoch | loss | validation loss | % chosen well |",
             "|---|---|---|---|",
@@ -119,7 +117,8 @@ def _verdict(verdict: Verdict) -> str:
             "",
             f"{verdict.waypoints} waypoints, {verdict.views} views. The chosen view localizes at "
             f"{100 * verdict.chosen:.1f} % of the waypoints",
-            f"(most visible landmarks {100 * verdict.most_visible:.1f} %, best possible {100 * verdict.possible:.1f} %).",
+            f"(most visible landmarks {100 * verdict.most_visible:.1f} %, best possible "
+            f"{100 * verdict.possible:.1f} %).",
             f"Brier score {found.brier:.4f} ({found.brier_of_rate:.4f} by always saying the mean rate), log loss "
             f"{found.log_loss:.4f}.",
             "",

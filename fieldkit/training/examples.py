@@ -193,9 +193,7 @@ class Split:
     validation: SceneFolder
 
 
-def split_scenes(
-    scenes: Sequence[SceneFolder], *, validate: str | None = None, tests: Sequence[Path] = ()
-) -> Split:
+def split_scenes(scenes: Sequence[SceneFolder], *, validate: str | None = None, tests: Sequence[Path] = ()) -> Split:
     """Split scenes into those to train on and one to validate on: never by view, and never a view in both.
 
     Without a name the last scene in alphabetical order is the one to validate on. Raises TrainingError when there is

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fieldkit.learned.batches import padded
 from fieldkit.training.examples import Examples, Progress
 from fieldkit.training.rules import TrainingRules
-from fieldkit.views import HISTOGRAM_WIDTH, TOKEN_WIDTH, SeenLandmarks, landmark_tokens, thinned, view_histograms
+from fieldkit.views import HEAT_CELLS, HISTOGRAM_WIDTH, TOKEN_WIDTH, landmark_tokens, thinned, view_histograms
 
 Floats = NDArray[np.float32]
 Arrays = tuple[NDArray[np.generic], ...]
@@ -107,3 +107,12 @@ class TokenInputs:
             camera=scene.camera,
             appearance=self._appearance[number] if self._appearance else None,
         )
+
+
+def _mirror(tokens: Floats) -> None:
+    """Mirror views left to right in place: where their landmarks are seen, and where mapping saw them."""
+    u = _PLACES.stop - 2
+    tokens[..., u] = 1.0 - tokens[..., u]
+    heat = tokens[..., _PLACES.stop : TOKEN_WIDTH]
+    cells = heat.reshape(*heat.shape[:2], HEAT_CELLS, HEAT_CELLS)[..., ::-1]
+    tokens[..., _PLACES.stop : TOKEN_WIDTH] = cells.reshape(heat.shape)

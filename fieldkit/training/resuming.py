@@ -61,7 +61,9 @@ def write_state(out: Path, state: State, *, key: str) -> None:
 
     head = _Head(1, key, state.best, state.history)
     parts = {"network": state.network, "optimizer": state.optimizer, "kept": state.kept}
-    tensors = {f"{part}/{name}": np.ascontiguousarray(v) for part, values in parts.items() for name, v in values.items()}
+    tensors = {
+        f"{part}/{name}": np.ascontiguousarray(v) for part, values in parts.items() for name, v in values.items()
+    }
     atomic_write(state_path(out), save(tensors, metadata={_KEY: json.dumps(plain(head))}))
 
 

@@ -19,8 +19,8 @@ class TrainingRules:
     the validation scene end it early. Every step takes ``batch`` views; the learning rate rises to ``learning_rate``
     and falls as a cosine. ``occluded`` is the share of the views that are shown without the landmarks behind the
     surface, the others with all: one network serves both. ``cap``: landmarks of a view that are looked at, at most.
-    ``smoothing`` of the labels, and ``jitter``: see `fieldkit.training.inputs`. Raises TrainingError where a value
-    cannot be used.
+    ``jitter`` scales the noise that is put on landmarks, see `fieldkit.training.inputs`. Raises TrainingError where a
+    value cannot be used.
     """
 
     model: ModelName = "vpt"
@@ -31,7 +31,7 @@ class TrainingRules:
     learning_rate: float = 1e-3
     weight_decay: float = 0.01
     cap: int | None = None
-    occluded: float = 0.7
+    occluded: float = 0.9
     jitter: float = 1.0
 
     def __post_init__(self) -> None:
@@ -41,9 +41,10 @@ class TrainingRules:
                 raise TrainingError(f"{name} is {value}; expected a positive number", hint=f"choose another {name}")
         if not 0 <= self.seed < 2**31:
             raise TrainingError(f"seed is {self.seed}; expected 0..{2**31 - 1}", hint="choose another seed")
-        for name, value in {"learning_rate": self.learning_rate, "weight_decay": self.weight_decay}.items():
-            if not (math.isfinite(value) and value >= 0):
-                raise TrainingError(f"{name} is {value:g}; expected 0 or more", hint=f"choose another {name}")
+        sizes = {"learning_rate": self.learning_rate, "weight_decay": self.weight_decay, "jitter": self.jitter}
+        for name, size in sizes.items():
+            if not (math.isfinite(size) and size >= 0):
+                raise TrainingError(f"{name} is {size:g}; expected 0 or more", hint=f"choose another {name}")
         if not 0 <= self.occluded <= 1:
             raise TrainingError(f"occluded is {self.occluded:g}; expected a share", hint="choose 0..1")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -86,9 +86,7 @@ def train(
         training={"rules": plain(dataclasses.asdict(rules)), "epochs": len(fitted.history), "best": fitted.best + 1},
         versions=versions,
     )
-    verdicts = tuple(
-        _verdict(scenes[-1], fitted, calibration, occlusion=use) for use in (True, False)
-    )
+    verdicts = tuple(_verdict(scenes[-1], fitted, calibration, occlusion=use) for use in (True, False))
     counts = [_count(s, "training") for s in scenes[:-1]] + [_count(scenes[-1], "validation")]
     write_card(out, about, rules=rules, scenes=counts, history=fitted.history, verdicts=verdicts)
     write_checkpoint(out, Checkpoint(about, fitted.weights))
@@ -132,6 +130,7 @@ def _inputs(scenes: Sequence[Examples], rules: TrainingRules, progress: Progress
 
 def _data_digest(split: Split) -> str:
     """Return the digest of all views, and of which scenes are trained on and which validates."""
+
     def told(scene: SceneFolder) -> str:
         shards = (shard_path(scene.folder, scene.name, w) for w in scene.entry.waypoints)
         return digest(scene_path(scene.folder, scene.name), *shards)
