@@ -11,8 +11,8 @@ from scipy.special import gammaln
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.bool_]
-# A network that separates every view would otherwise be trusted without bound
-_SLOPES = (1e-2, 1e2)
+# A network that separates every view, or none, would otherwise be trusted without bound
+_LOG_SLOPES = (-np.log(10.0), np.log(10.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,9 +47,10 @@ def fit_calibration(log_odds: Array, label: Labels) -> Calibration:
     def cost(x: Array) -> float:
         return log_loss(np.exp(x[0]) * log_odds + x[1], label)
 
-    found = minimize(cost, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 2000})
-    slope = float(np.clip(np.exp(found.x[0]), *_SLOPES))
-    return Calibration(1.0 / slope, float(found.x[1]))
+    rate = float(np.clip(np.mean(label), 1e-3, 1.0 - 1e-3))
+    start = np.array([0.0, np.log(rate / (1.0 - rate)) - float(np.mean(log_odds))])
+    found = minimize(cost, start, method="L-BFGS-B", bounds=(_LOG_SLOPES, (None, None)))
+    return Calibration(float(np.exp(-found.x[0])), float(found.x[1]))
 
 
 @dataclasses.dataclass(frozen=True)

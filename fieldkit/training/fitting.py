@@ -56,10 +56,12 @@ def fit(
     rules: TrainingRules,
     out: Path,
     key: str,
+    force: bool = False,
     progress: Progress | None = None,
 ) -> Fitted:
     """Fit a network; after every epoch its state is kept beside ``out``, from which the same call goes on.
 
+    With ``force`` the state of another training there is replaced, else it raises TrainingError.
     Classes weigh the same, whatever their numbers. The epoch whose choices in the validation scene are best is kept.
     """
     import torch
@@ -68,7 +70,7 @@ def fit(
     with _repeatable(rules.seed):
         network = make().to(device)
         optimizer = torch.optim.AdamW(network.parameters(), lr=rules.learning_rate, weight_decay=rules.weight_decay)
-        state = read_state(out, key=key)
+        state = read_state(out, key=key, force=force)
         if state is not None:
             _restore(network, optimizer, state)
         history, best, kept = ((), 0, None) if state is None else (state.history, state.best, dict(state.kept))
@@ -78,7 +80,7 @@ def fit(
             odds = _log_odds(network, material.validation)
             now = Epoch(loss, *_judged(odds, material))
             history = (*history, now)
-            if kept is None or now.chosen > history[best].chosen:
+            if kept is None or _rank(now) > _rank(history[best]):
                 best, kept = len(history) - 1, _arrays(network.state_dict())
             write_state(out, State(_arrays(network.state_dict()), _moments(optimizer), kept, best, history), key=key)
             if progress is not None:
@@ -86,6 +88,10 @@ def fit(
         assert kept is not None
         network.load_state_dict({name: torch.from_numpy(value) for name, value in kept.items()})
         return Fitted(kept, best, history, _log_odds(network, material.validation))
+
+
+def _rank(epoch: Epoch) -> tuple[float, float]:
+    return epoch.chosen, -epoch.validation_loss
 
 
 def _told(rules: TrainingRules, history: tuple[Epoch, ...], best: int) -> str:

@@ -67,17 +67,27 @@ def write_state(out: Path, state: State, *, key: str) -> None:
     atomic_write(state_path(out), save(tensors, metadata={_KEY: json.dumps(plain(head))}))
 
 
-def read_state(out: Path, *, key: str) -> State | None:
+def read_state(out: Path, *, key: str, force: bool = False) -> State | None:
     """Read the state of an unfinished training, None where there is none.
 
-    Raises TrainingError when it is damaged, of another version, or of a training with other settings or data.
+    Raises TrainingError when it is damaged, of another version, or of a training with other settings or data; with
+    ``force`` such a one counts as none.
     """
+    try:
+        return _read(out, key=key)
+    except TrainingError:
+        if not force:
+            raise
+        return None
+
+
+def _read(out: Path, *, key: str) -> State | None:
     from safetensors import SafetensorError, safe_open
 
     path = state_path(out)
     if not path.is_file():
         return None
-    again = "remove it to start over, or choose another --out"
+    again = "give --force to start over, or choose another --out"
     try:
         with safe_open(path, framework="numpy") as file:
             head = convert(json.loads((file.metadata() or {})[_KEY]), _Head, path=path, what=WHAT)
@@ -89,7 +99,7 @@ def read_state(out: Path, *, key: str) -> State | None:
     if head.key != key:
         raise TrainingError(
             f"{path}: is of a training with other settings, data or program; expected the same",
-            hint=f"give the settings that it was started with, {again}",
+            hint=f"give the settings that it was started with, or {again}",
         )
     parts: dict[str, dict[str, NDArray[Any]]] = {"network": {}, "optimizer": {}, "kept": {}}
     for name, value in tensors.items():

@@ -71,7 +71,7 @@ def train(
     data = _data_digest(split)
     versions = {name: version for name, version in library_versions().items() if name in _LIBRARIES}
     key = digest(data, repr(rules), repr(sorted(versions.items())))
-    fitted = fit(lambda: _network(rules), material, rules=rules, out=out, key=key, progress=progress)
+    fitted = fit(lambda: _network(rules), material, rules=rules, out=out, key=key, force=force, progress=progress)
     calibration = fit_calibration(fitted.log_odds.ravel(), np.tile(scenes[-1].label, len(fitted.log_odds)))
     about = About(
         kind=rules.model,
@@ -119,9 +119,23 @@ def _refuse_one_class(split: Split, scenes: Sequence[Examples]) -> None:
 
 
 def _network(rules: TrainingRules) -> torch.nn.Module:
+    """Return a network with random weights as large as ReLU layers need (He et al., ICCV 2015).
+
+    With torch's own, smaller ones what passes the MLP's nine layers hardly depends on the view at first.
+    """
+    from torch import nn
+
     from fieldkit.learned.networks import Mlp, Vpt
 
-    return Mlp() if rules.model == "mlp" else Vpt()
+    if rules.model != "mlp":
+        return Vpt()
+    network = Mlp()
+    for layer in network.modules():
+        if isinstance(layer, nn.Linear | nn.Conv1d):
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+            assert layer.bias is not None
+            nn.init.zeros_(layer.bias)
+    return network
 
 
 def _inputs(scenes: Sequence[Examples], rules: TrainingRules, progress: Progress | None) -> Inputs:
