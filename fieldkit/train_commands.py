@@ -21,7 +21,7 @@ def train(
     datasets: Positional[tuple[Path, ...]],
     *,
     out: Path,
-    model: Literal["mlp", "vpt", "vpt_appearance"] = "vpt",
+    model: Literal["mlp", "vpt", "vpt_appearance", "vpt_dino"] = "vpt",
     validate: str | None = None,
     test: Repeated[tuple[Path, ...]] = (),
     seed: int = 0,
@@ -37,7 +37,7 @@ def train(
     Args:
         datasets: dataset folders, finished and made with the same settings
         out: .safetensors file to write
-        model: mlp, vpt, or vpt_appearance
+        model: mlp, vpt, or with the appearance of landmarks vpt_appearance (EfficientNet) or vpt_dino (DINOv2)
         validate: scene by which epoch and temperature are chosen; by default the last one in alphabetical order
         test: dataset of test scenes: none of them may be trained or validated on; may be repeated
         seed: seed of weights, order and variations

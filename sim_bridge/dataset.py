@@ -19,6 +19,7 @@ from fieldkit.dataset import (
     SceneCount,
     SourceView,
     SourceWaypoint,
+    add_appearances,
     count_scenes,
     make_dataset,
 )
@@ -215,7 +216,8 @@ class MeshSource(SceneSource):
 class DatasetOptions:
     """What is asked for of every scene: places, directions, sensors and changes by name or file, and repeats.
 
-    ``mesh`` says how the meshes among the scenes are to be read.
+    ``mesh`` says how the meshes among the scenes are to be read. ``appearance`` names a network whose view of the
+    landmarks is added to the maps; it changes nothing else.
     """
 
     seed: int = 0
@@ -226,6 +228,7 @@ class DatasetOptions:
     repeats: int = 0
     repeat_share: float = 0.1
     mesh: MeshOptions = dataclasses.field(default_factory=MeshOptions)
+    appearance: str | None = None
 
 
 def make_scenes(
@@ -262,8 +265,9 @@ def make_scenes(
         changes=find_changes(options.changes),
     )
     rules = DatasetRules(repeats=options.repeats, repeat_share=options.repeat_share)
+    sources = [_source(name, chosen, options.mesh) for name in scenes]
     make_dataset(
-        [_source(name, chosen, options.mesh) for name in scenes],
+        sources,
         out,
         described=json.loads(json.dumps(dataclasses.asdict(chosen), default=msgspec.to_builtins)),
         rules=rules,
@@ -271,6 +275,8 @@ def make_scenes(
         force=force,
         progress=progress,
     )
+    if options.appearance is not None:
+        add_appearances(sources, out, network=options.appearance)
     return count_scenes(out)
 
 

@@ -16,6 +16,7 @@ _SEES = {
     "mlp": "146 numbers of a whole view (histograms of its landmarks)",
     "vpt": "73 numbers per landmark of a view",
     "vpt_appearance": "76 numbers per landmark of a view, three of them its appearance",
+    "vpt_dino": "76 numbers per landmark of a view, three of them its appearance",
 }
 
 

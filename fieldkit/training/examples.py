@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,7 @@ class Examples:
 
     ``label`` bool[v]: the view localized; ``waypoint`` int32[v] its number. ``rows``: views i sees, of the k landmarks
     in view, ``starts[i]:starts[i + 1]``; ``seen`` holds all k one after the other, ``occluded`` bool[k].
+    ``appearance`` f16[n, width] of the map's landmarks, by the network that saw them.
     """
 
     scene: str
@@ -60,6 +61,7 @@ class Examples:
     starts: NDArray[np.int64]
     seen: SeenLandmarks
     occluded: NDArray[np.bool_]
+    appearance: Mapping[str, NDArray[np.float16]]
 
     def view(self, number: int, *, occlusion: bool) -> SeenLandmarks:
         """Return what a view sees; with ``occlusion`` without the landmarks behind the surface."""
@@ -144,7 +146,8 @@ def read_examples(scene: SceneFolder, *, progress: Progress | None = None) -> Ex
         camera = shard.camera if camera is None else _same(camera, shard, scene)
         if progress is not None:
             progress(f"read {scene.name}", number + 1, len(scene.entry.waypoints))
-    assert camera is not None, "a scene has a waypoint"
+    if camera is None or not parts:
+        raise DatasetError(f"{scene.folder}: the scene {scene.name!r} has no views; expected some", hint="make it again")
     counts = [len(p.occluded) for p in parts]
     return Examples(
         scene=scene.name,
@@ -156,7 +159,8 @@ def read_examples(scene: SceneFolder, *, progress: Progress | None = None) -> Ex
         waypoint=np.concatenate(waypoints),
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         seen=_joined([p.seen for p in parts]),
-        occluded=np.concatenate([p.occluded for p in parts]) if parts else np.zeros(0, dtype=bool),
+        occluded=np.concatenate([p.occluded for p in parts]),
+        appearance=scene_map.appearance,
     )
 
 

@@ -8,7 +8,9 @@ from typing import Literal
 
 from fieldkit.errors import TrainingError
 
-ModelName = Literal["mlp", "vpt", "vpt_appearance"]
+ModelName = Literal["mlp", "vpt", "vpt_appearance", "vpt_dino"]
+# The network whose view of the landmarks a model takes
+APPEARANCE_OF: dict[str, str] = {"vpt_appearance": "efficientnet", "vpt_dino": "dinov2"}
 
 
 @dataclasses.dataclass(frozen=True)

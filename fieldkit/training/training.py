@@ -10,17 +10,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fieldkit.errors import TrainingError
-from fieldkit.learned.checkpoint import About, Checkpoint, write_checkpoint
+from fieldkit.learned.checkpoint import About, Checkpoint, Reduction, write_checkpoint
+from fieldkit.learned.scoring import APPEARANCE_WIDTH
+from fieldkit.maps import known_appearances
 from fieldkit.store import digest, library_versions
-from fieldkit.store.datasets import scene_path, shard_path
+from fieldkit.store.datasets import map_path, scene_path, shard_path
 from fieldkit.store.files import plain, refuse_existing
 from fieldkit.training.calibrating import Calibration, chosen_share, fit_calibration, reliability
 from fieldkit.training.card import SceneCount, Verdict, card_path, write_card
 from fieldkit.training.examples import Examples, Progress, SceneFolder, Split, find_scenes, read_examples, split_scenes
 from fieldkit.training.fitting import Fitted, Material, fit
 from fieldkit.training.inputs import HistogramInputs, Inputs, TokenInputs
+from fieldkit.training.reducing import fit_reduction
 from fieldkit.training.resuming import forget_state
-from fieldkit.training.rules import TrainingRules
+from fieldkit.training.rules import APPEARANCE_OF, TrainingRules
+from fieldkit.views import TOKEN_WIDTH
 
 if TYPE_CHECKING:
     import torch
@@ -65,9 +69,9 @@ def train(
     split = split_scenes(find_scenes(datasets), validate=validate, tests=tests)
     scenes = [read_examples(s, progress=progress) for s in (*split.training, split.validation)]
     _refuse_one_class(split, scenes)
-    material = Material(
-        _inputs(scenes[:-1], rules, progress), _inputs(scenes[-1:], rules, progress), scenes[-1].waypoint
-    )
+    reduction = _reduction(scenes[:-1], split, rules)
+    training, validation = (_inputs(part, rules, reduction, progress) for part in (scenes[:-1], scenes[-1:]))
+    material = Material(training, validation, scenes[-1].waypoint)
     data = _data_digest(split)
     versions = {name: version for name, version in library_versions().items() if name in _LIBRARIES}
     key = digest(data, repr(rules), repr(sorted(versions.items())))
@@ -83,13 +87,14 @@ def train(
         seed=rules.seed,
         temperature=calibration.temperature,
         bias=calibration.bias,
+        appearance=APPEARANCE_OF.get(rules.model),
         training={"rules": plain(dataclasses.asdict(rules)), "epochs": len(fitted.history), "best": fitted.best + 1},
         versions=versions,
     )
     verdicts = tuple(_verdict(scenes[-1], fitted, calibration, occlusion=use) for use in (True, False))
     counts = [_count(s, "training") for s in scenes[:-1]] + [_count(scenes[-1], "validation")]
     write_card(out, about, rules=rules, scenes=counts, history=fitted.history, verdicts=verdicts)
-    write_checkpoint(out, Checkpoint(about, fitted.weights))
+    write_checkpoint(out, Checkpoint(about, fitted.weights, reduction))
     forget_state(out)
     return TrainingReport(
         path=out,
@@ -128,7 +133,7 @@ def _network(rules: TrainingRules) -> torch.nn.Module:
     from fieldkit.learned.networks import Mlp, Vpt
 
     if rules.model != "mlp":
-        return Vpt()
+        return Vpt(tokens=TOKEN_WIDTH + (APPEARANCE_WIDTH if rules.model in APPEARANCE_OF else 0))
     network = Mlp()
     for layer in network.modules():
         if isinstance(layer, nn.Linear | nn.Conv1d):
@@ -138,8 +143,32 @@ def _network(rules: TrainingRules) -> torch.nn.Module:
     return network
 
 
-def _inputs(scenes: Sequence[Examples], rules: TrainingRules, progress: Progress | None) -> Inputs:
-    return HistogramInputs(scenes, progress=progress) if rules.model == "mlp" else TokenInputs(scenes, rules)
+def _reduction(scenes: Sequence[Examples], split: Split, rules: TrainingRules) -> Reduction | None:
+    """Return how the appearance that a model takes becomes numbers, None where it takes none.
+
+    Raises TrainingError for a scene whose map has no such appearance.
+    """
+    network = APPEARANCE_OF.get(rules.model)
+    if network is None:
+        return None
+    for scene in (*split.training, split.validation):
+        folder = map_path(scene.folder, scene.entry)
+        if network not in known_appearances(folder):
+            raise TrainingError(
+                f"{folder}: has no appearance of its landmarks by {network}, which {rules.model} takes; expected it",
+                hint=f"add it: sim-bridge dataset with the same options and --appearance {network}",
+            )
+    return fit_reduction([s.appearance[network] for s in scenes])
+
+
+def _inputs(
+    scenes: Sequence[Examples], rules: TrainingRules, reduction: Reduction | None, progress: Progress | None
+) -> Inputs:
+    if rules.model == "mlp":
+        return HistogramInputs(scenes, progress=progress)
+    network = APPEARANCE_OF.get(rules.model, "")
+    reduced = () if reduction is None else tuple(reduction(s.appearance[network]) for s in scenes)
+    return TokenInputs(scenes, rules, appearance=reduced)
 
 
 def _data_digest(split: Split) -> str:
