@@ -19,7 +19,7 @@ from fieldkit.check_commands import tags_check
 from fieldkit.console import ProgressBars, cells, log_handler, make_table, print_json, print_mapping
 from fieldkit.errors import FieldkitError, ReplayError
 from fieldkit.localize_commands import localize
-from fieldkit.map_commands import map_build, map_compact, map_export, map_import, map_info
+from fieldkit.map_commands import map_appearance, map_build, map_compact, map_export, map_import, map_info
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
 from fieldkit.tag_tables import print_second, print_tags, second_json, tags_json
 from fieldkit.train_commands import train
@@ -120,6 +120,7 @@ def replay(
     hand: Path | None = None,
     protocol: str = "paper_real",
     weights: Path | None = None,
+    policy_weights: Path | None = None,
     force: bool = False,
 ) -> int:
     """Replay recordings through every policy of a protocol; print the recall table, exit with 3 on a missed bound.
@@ -133,6 +134,7 @@ def replay(
         hand: hand.toml to use in place of what the recordings state, as of `tags check --refine-hand`
         protocol: name of a protocol, or a .toml file
         weights: folder where the weights of networks are looked for first
+        policy_weights: checkpoint of a learned policy, or a folder of them, to use in place of what fieldkit ships
         force: replace an existing run
     """
     from fieldkit import protocol as protocols
@@ -147,7 +149,9 @@ def replay(
         if sets:
             from fieldkit.dataset import replay_datasets
 
-            run = replay_datasets(sets, protocol=rules, out=out, force=force, progress=progress)
+            run = replay_datasets(
+                sets, protocol=rules, out=out, policy_weights=policy_weights, force=force, progress=progress
+            )
         else:
             from fieldkit.replay import replay as replay_recordings
 
@@ -160,6 +164,7 @@ def replay(
                 hand_path=hand,
                 protocol=rules,
                 out=out,
+                policy_weights=policy_weights,
                 force=force,
                 progress=progress,
             )
@@ -281,6 +286,7 @@ GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
         "export": map_export,
         "info": map_info,
         "compact": map_compact,
+        "appearance": map_appearance,
     },
     "tags": {
         "sheet": tags_sheet,

@@ -187,3 +187,25 @@ def map_compact(path: Positional[Path], *, out: Path, force: bool = False) -> No
 
     maps.compact_map(path, out, force=force)
     print_mapping(maps.map_info(out), title=str(out))
+
+
+def map_appearance(
+    path: Positional[Path],
+    *,
+    source: Path,
+    network: Literal["efficientnet", "dinov2"] = "efficientnet",
+    weights: Path | None = None,
+) -> None:
+    """Add to a map what a network of appearance sees at its landmarks, as the policies with appearance need it.
+
+    Args:
+        path: map folder
+        source: folder with the mapping images from which the map was built
+        network: network of appearance
+        weights: folder where the weights of networks are looked for first
+    """
+    from fieldkit import maps
+
+    with ProgressBars() as progress:
+        maps.add_appearance(path, source, network=network, weights=weights, progress=progress)
+    print_mapping(maps.map_info(path), title=str(path))

@@ -74,6 +74,7 @@ def replay(
     tags_path: Path | None = None,
     camera_path: Path | None = None,
     hand_path: Path | None = None,
+    policy_weights: Path | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Run:
@@ -85,9 +86,7 @@ def replay(
     without prior, truth or candidates is excluded with its reason, and so is a view without truth or odometry.
     """
     store.refuse_existing(Path(out), force=force, marker="run.json")
-    for name in protocol.policies:
-        if name not in policies.NOT_RANKED:
-            policies.available(name)
+    checkpoints, unweighted = policies.find_checkpoints(protocol.policies, given=policy_weights)
     if not recordings:
         raise ReplayError("no recording given; expected at least one", hint="name a bag or a session folder")
     given = store.read_corrections(camera=camera_path, hand=hand_path)
@@ -99,16 +98,19 @@ def replay(
     _check_names(opened)
     for file in given.applied:
         log.info("%s takes the place of what the recordings state of the %s", file.path, file.kind)
+    look = policies.Looker(scene_map, protocol, checkpoints=checkpoints)
+    excluded = _excluded_rows(scene_map, protocol, (*unweighted, *look.excluded))
     sessions = [
-        _replay_session(r, scene_map, tags, protocol, applied=given.applied, cache=cache, progress=progress)
+        _replay_session(r, look, scene_map, tags, protocol, applied=given.applied, cache=cache, progress=progress)
         for r in opened
     ]
     run = _collect(opened, sessions, scene_map=scene_map, tags=tags, applied=given.applied, protocol=protocol)
-    run = dataclasses.replace(run, map_seconds=maps.map_info(map_path).get("seconds", {}))
-    unfiltered = policies.unfiltered(scene_map, protocol)
-    if unfiltered is not None:
-        log.warning("%s are excluded: %s", unfiltered.what, unfiltered.reason)
-        run = dataclasses.replace(run, excluded=(unfiltered, *run.excluded))
+    run = dataclasses.replace(
+        run,
+        map_seconds=maps.map_info(map_path).get("seconds", {}),
+        excluded=(*excluded, *run.excluded),
+        weights=look.weights,
+    )
     if not run.trials:
         reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3]) or "there is no visit"
         raise ReplayError(f"{recordings[0]}: no visit could be scored: {reasons}", hint="see the reasons")
@@ -118,6 +120,15 @@ def replay(
     store.write_run(out, run, force=force)
     cache.remove()
     return run
+
+
+def _excluded_rows(scene_map: SceneMap, protocol: Protocol, learned: Sequence[Excluded]) -> tuple[Excluded, ...]:
+    """Return the rows that weights or map leave out, with a warning for each."""
+    unfiltered = policies.unfiltered(scene_map, protocol)
+    result = (*(() if unfiltered is None else (unfiltered,)), *learned)
+    for item in result:
+        log.warning("%s: excluded: %s", item.what, item.reason)
+    return result
 
 
 def _load_tags(path: Path | None, scene_map: SceneMap) -> TagMap:
@@ -181,6 +192,7 @@ class _Ready:
 
 def _replay_session(
     recording: Recording,
+    look: policies.Looker,
     scene_map: SceneMap,
     tags: TagMap,
     protocol: Protocol,
@@ -200,13 +212,14 @@ def _replay_session(
         log.warning("%s: %s", recording.path, warning)
     ready, excluded = _prepare(recording, tags, protocol)
     localizer = Localizer(scene_map, protocol.localizer, seed=protocol.seed)
-    look = policies.Looker(scene_map, protocol)
     parts = []
     for number, (visit_id, known) in enumerate(ready.items(), start=1):
         if progress is not None:
             progress(f"replay {recording.name}", number, len(ready))
         prior_error = _prior_error(recording, known.prior, known.truths)
-        plan = VisitPlan(recording.name, known.prior, prior_error, known.candidates, look.utilities(known.candidates))
+        utilities = look.utilities(known.candidates)
+        reasons = look.reasons(known.candidates, utilities)
+        plan = VisitPlan(recording.name, known.prior, prior_error, known.candidates, utilities, reasons)
         views = next(v for v in recording.visits if v.id == visit_id).views
         chosen = {v.id: v for v in views if v.id in known.candidates.view_ids}
         parts.append(

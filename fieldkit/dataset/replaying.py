@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import cast
@@ -12,6 +13,7 @@ import numpy as np
 from fieldkit import maps, policies, scores, store
 from fieldkit.errors import DatasetError
 from fieldkit.frames import pose_error
+from fieldkit.learned.checkpoint import Checkpoint
 from fieldkit.protocol import Protocol
 from fieldkit.store.datasets import (
     DatasetFile,
@@ -30,6 +32,7 @@ from fieldkit.store.datasets import (
 from fieldkit.types import (
     Candidates,
     Estimate,
+    Excluded,
     PlanView,
     Prior,
     Run,
@@ -43,6 +46,7 @@ from fieldkit.types import (
 )
 from fieldkit.views import forward_directions, plan_view
 
+log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 
 
@@ -72,6 +76,7 @@ def replay_datasets(
     *,
     protocol: Protocol,
     out: Path,
+    policy_weights: Path | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Run:
@@ -81,9 +86,7 @@ def replay_datasets(
     otherwise than the protocol says.
     """
     store.refuse_existing(Path(out), force=force, marker="run.json")
-    for name in protocol.policies:
-        if name not in policies.NOT_RANKED:
-            policies.available(name)
+    checkpoints, unweighted = policies.find_checkpoints(protocol.policies, given=policy_weights)
     scenes = [scene for path in datasets for scene in _scenes(Path(path), protocol)]
     twice = [s.session for s in scenes if [o.session for o in scenes].count(s.session) > 1]
     if twice:
@@ -91,7 +94,11 @@ def replay_datasets(
             f"{', '.join(str(d) for d in datasets)}: hold the scene {twice[0]!r} twice; expected it once",
             hint="replay the datasets one by one",
         )
-    parts = [_replay_scene(scene, protocol, progress=progress) for scene in scenes]
+    checkpoints, lacking = _servable(scenes, checkpoints)
+    excluded = (*unweighted, *lacking)
+    for item in excluded:
+        log.warning("%s: excluded: %s", item.what, item.reason)
+    parts = [_replay_scene(scene, protocol, checkpoints, progress=progress) for scene in scenes]
     run = Run(
         protocol=protocol,
         map_digest=parts[0].map_digest if len(parts) == 1 else store.digest(*(p.map_digest for p in parts)),
@@ -107,9 +114,26 @@ def replay_datasets(
         # Maps of several scenes have nothing in common that could be drawn in one picture.
         plan_view=parts[0].plan_view if len(parts) == 1 else PlanView(*2 * (np.zeros((0, 3), np.float32),)),
         thumbnails={},
+        excluded=excluded,
+        weights={name: checkpoint.digest for name, checkpoint in checkpoints.items()},
     )
     store.write_run(out, run, force=force)
     return run
+
+
+def _servable(
+    scenes: Sequence[_Scene], checkpoints: Mapping[str, Checkpoint]
+) -> tuple[dict[str, Checkpoint], tuple[Excluded, ...]]:
+    """Return the checkpoints that all maps can serve, and which are left out: some scenes alone would mislead."""
+    lacking: dict[str, Excluded] = {}
+    for name, checkpoint in checkpoints.items():
+        network = checkpoint.about.appearance
+        for scene in scenes:
+            path = map_path(scene.folder, scene.entry)
+            if network is not None and network not in maps.known_appearances(path):
+                reason = f"{path} lacks the appearance {network} of its landmarks"
+                lacking.setdefault(name, Excluded(name, f"{reason}; add it with `fieldkit map appearance`"))
+    return {n: c for n, c in checkpoints.items() if n not in lacking}, tuple(lacking.values())
 
 
 def _scenes(path: Path, protocol: Protocol) -> list[_Scene]:
@@ -146,12 +170,14 @@ def _refuse_other(path: Path, rules: DatasetRules, protocol: Protocol) -> None:
             )
 
 
-def _replay_scene(scene: _Scene, protocol: Protocol, *, progress: Progress | None) -> _Part:
+def _replay_scene(
+    scene: _Scene, protocol: Protocol, checkpoints: Mapping[str, Checkpoint], *, progress: Progress | None
+) -> _Part:
     folder, entry = scene.folder, scene.entry
     scene_map = _load_map(scene)
     policies.check_map(scene_map, protocol)
     gauge = read_gauge(map_path(folder, entry))
-    look = policies.Looker(scene_map, protocol)
+    look = policies.Looker(scene_map, protocol, checkpoints=checkpoints)
     shards = [read_scene_shard(folder, entry, w) for w in entry.waypoints]
     priors = [_prior(shard) for shard in shards]
     visits = [Visit(s.waypoint, 0, 0, (), s.next) for s in shards]

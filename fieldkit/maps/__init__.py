@@ -1,5 +1,7 @@
 """Maps: structure from motion, metric alignment, landmarks and surface, from images to a map folder and back."""
 
+from fieldkit.maps.appearance import known_appearances
+from fieldkit.maps.appearing import add_appearance
 from fieldkit.maps.build import MapReport, build_map
 from fieldkit.maps.compact import compact_map
 from fieldkit.maps.exchange.exporting import Exported, export_map
@@ -22,12 +24,14 @@ __all__ = [
     "MapOptions",
     "MapReport",
     "MapWarp",
+    "add_appearance",
     "build_map",
     "compact_map",
     "content_digest",
     "export_map",
     "fit_gauge",
     "import_map",
+    "known_appearances",
     "load_map",
     "map_info",
     "map_warp",

@@ -15,6 +15,7 @@ import numpy as np
 from fieldkit.errors import MapError, suggestion
 from fieldkit.features import FEATURES, Features
 from fieldkit.maps import whole
+from fieldkit.maps.appearance import known_appearances, read_appearances
 from fieldkit.maps.colmap import read_model
 from fieldkit.maps.descriptors import MAX_BYTES, read_landmark_descriptors
 from fieldkit.maps.landmarks import landmark_covariance
@@ -173,6 +174,7 @@ def load_map(path: Path) -> SceneMap:
         surface=_read_surface(path, entry.surface),
         retrieval=retrieval,
         image_vectors=vectors,
+        appearance=read_appearances(path, digest=entry.digest, count=len(model.xyz)),
     )
 
 
@@ -217,7 +219,8 @@ def map_info(path: Path) -> dict[str, Any]:
     """Return what map.toml says of a map, as plain values, with its path, and how it was built where that is kept."""
     entry, record = read_map_file(path), read_record(Path(path))
     built = {} if record is None else {"seconds": record.seconds, "versions": record.versions}
-    return {"path": str(path), **msgspec.to_builtins(entry), **built}
+    seen = known_appearances(path)
+    return {"path": str(path), **msgspec.to_builtins(entry), **built, **({"appearance": list(seen)} if seen else {})}
 
 
 def write_map_file(path: Path, entry: MapFile) -> None:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
+
 from fieldkit.errors import PolicyError
 from fieldkit.features import feature_name
+from fieldkit.learned.checkpoint import Checkpoint
+from fieldkit.policies.learned import LEARNED, open_learned, without_appearance
 from fieldkit.policies.scene import Scene, look_at
-from fieldkit.policies.table import NOT_RANKED, POLICIES, Array, available, utility
+from fieldkit.policies.table import NOT_RANKED, POLICIES, Array, Policy, available, utility
 from fieldkit.protocol import Protocol
 from fieldkit.surface import RayCaster
-from fieldkit.types import Candidates, Excluded, SceneMap
-from fieldkit.views import landmark_statistics
+from fieldkit.types import Candidates, Excluded, Reason, SceneMap
+from fieldkit.views import HeatMaps, landmark_statistics
+
+Variant = tuple[str, bool | None]
 
 
 def check_map(scene_map: SceneMap, protocol: Protocol) -> None:
@@ -40,32 +48,65 @@ def unfiltered(scene_map: SceneMap, protocol: Protocol) -> Excluded | None:
 
 
 class Looker:
-    """Compute every policy's utilities of candidates; landmark statistics and rays are made once per map."""
+    """Compute every policy's utilities of candidates; landmark statistics, rays and networks are made once per map.
 
-    def __init__(self, scene_map: SceneMap, protocol: Protocol) -> None:
+    ``checkpoints`` are those of the protocol's learned policies. ``excluded`` are those whose checkpoint is there and
+    that this map cannot serve. Raises WeightsError where weights do not fit their network.
+    """
+
+    def __init__(
+        self, scene_map: SceneMap, protocol: Protocol, *, checkpoints: Mapping[str, Checkpoint] | None = None
+    ) -> None:
         self._map = scene_map
         self._protocol = protocol
         self._statistics = landmark_statistics(scene_map)
+        self._heat_maps = HeatMaps(scene_map)
         self._rays = None if scene_map.surface is None else RayCaster(scene_map.surface)
         self._uses = tuple(use for use in protocol.occlusion.use if not use or self._rays is not None)
+        given = checkpoints or {}
+        lacking = {name: without_appearance(scene_map, c) for name, c in given.items()}
+        self.excluded = tuple(e for e in lacking.values() if e is not None)
+        self._learned = {name: open_learned(c, scene_map) for name, c in given.items() if lacking[name] is None}
 
-    def utilities(self, candidates: Candidates) -> dict[tuple[str, bool | None], Array]:
+    @property
+    def weights(self) -> dict[str, str]:
+        """The digests of the checkpoints of the learned policies that score here."""
+        return {name: policy.scorer.checkpoint.digest for name, policy in self._learned.items()}
+
+    def utilities(self, candidates: Candidates) -> dict[Variant, Array]:
         """Return utilities f64[v] per policy and occlusion (None where the policy counts no landmarks).
 
-        Without a surface there are none with the occlusion filter.
+        Without a surface there are none with the occlusion filter, and none of learned policies without a checkpoint.
         """
-        scenes = {use: self._scene(candidates, occlusion=use) for use in {False, *self._uses}}
-        result: dict[tuple[str, bool | None], Array] = {}
+        scenes = self._scenes(candidates)
+        result: dict[Variant, Array] = {}
         for name in self._protocol.policies:
-            if name in NOT_RANKED:
+            if name in NOT_RANKED or (name in LEARNED and name not in self._learned):
                 continue
-            policy = available(name)
+            policy = Policy(self._learned[name], counts_landmarks=True) if name in LEARNED else available(name)
             if policy.counts_landmarks:
                 for use in self._uses:
                     result[name, use] = utility(policy, scenes[use])
             else:
                 result[name, None] = utility(policy, scenes[False])
         return result
+
+    def reasons(self, candidates: Candidates, utilities: Mapping[Variant, Array]) -> dict[Variant, Reason]:
+        """Return for each learned policy the landmarks that made the score of the view it prefers, the first if tied.
+
+        A policy that may choose none of the views has no reason.
+        """
+        chosen = {v: int(np.argmax(u)) for v, u in utilities.items() if v[0] in self._learned and u.max() > -np.inf}
+        scenes = self._scenes(candidates) if chosen else {}
+        result = {}
+        for (name, use), view in chosen.items():
+            landmarks, raised = self._learned[name].raised(scenes[bool(use)], view)
+            xyz = self._map.xyz[landmarks].astype(np.float32)
+            result[name, use] = Reason(candidates.view_ids[view], xyz, raised)
+        return result
+
+    def _scenes(self, candidates: Candidates) -> dict[bool, Scene]:
+        return {use: self._scene(candidates, occlusion=use) for use in {False, *self._uses}}
 
     def _scene(self, candidates: Candidates, *, occlusion: bool) -> Scene:
         voxel_m = self._map.surface.voxel_m if self._map.surface is not None else 0.0
@@ -76,4 +117,5 @@ class Looker:
             rules=self._protocol.candidates,
             rays=self._rays if occlusion else None,
             tolerance_m=self._protocol.occlusion.tolerance_voxels * voxel_m,
+            heat_maps=self._heat_maps,
         )

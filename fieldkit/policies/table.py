@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import PolicyError, suggestion
-from fieldkit.policies import counting, fisher, passive
+from fieldkit.policies import counting, fisher, learned, passive
 from fieldkit.policies.scene import Scene
-from fieldkit.protocol import POLICY_NAMES
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,7 @@ POLICIES: dict[str, Policy] = {
     "max": Policy(counting.most_visible, counts_landmarks=True),
     "angle": Policy(counting.viewing_angle, counts_landmarks=True),
     "fim": Policy(fisher.fisher_information, counts_landmarks=True),
+    **{name: Policy(functools.partial(learned.score_shipped, name), counts_landmarks=True) for name in learned.LEARNED},
 }
 
 # Rows of the tables that rank nothing: the prior scored as a pose, and the oracle that scoring computes.
@@ -38,12 +39,10 @@ NOT_RANKED = ("odometry", "best_possible")
 
 
 def available(name: str) -> Policy:
-    """Return a policy by name; raises PolicyError when it is unknown or cannot run in this version."""
+    """Return a policy by name; raises PolicyError when it is unknown."""
     if name in POLICIES:
         return POLICIES[name]
     known = [*POLICIES, *NOT_RANKED]
-    if name in POLICY_NAMES:
-        raise PolicyError(f"policy {name!r} has no weights in this version", hint=f"use one of {', '.join(known)}")
     raise PolicyError(f"unknown policy {name!r}", hint=suggestion(name, known))
 
 

@@ -7,11 +7,12 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeVar, cast
 from urllib.parse import quote, unquote
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from fieldkit import protocol as protocols
 from fieldkit.cameras import Camera
@@ -36,11 +37,13 @@ from fieldkit.store.tags import read_tags, write_tags
 from fieldkit.types import (
     VIEW_KINDS,
     Applied,
+    Array,
     Candidates,
     Estimate,
     Excluded,
     PlanView,
     Prior,
+    Reason,
     Run,
     Trial,
     Truth,
@@ -49,7 +52,10 @@ from fieldkit.types import (
     VisitPlan,
 )
 
-TAGS_FILE = "tags.toml"
+T = TypeVar("T")
+# What is known of a visit (session and id) per policy and occlusion
+ByVisit = dict[tuple[str, str], dict[tuple[str, bool | None], T]]
+TAGS_FILE, REASONS_FILE = "tags.toml", "reasons.npz"
 TRIALS = (
     "session", "visit", "policy", "occlusion", "view", "weight", "utility", "status", "cam_position_m",
     "cam_rotation_deg", "body_position_m", "body_rotation_deg", "truth_sigma_m", "truth_sigma_deg", "prior_error_m",
@@ -83,6 +89,7 @@ class _RunFile(msgspec.Struct, forbid_unknown_fields=True):
     excluded: list[Excluded]
     corrections: list[Applied] = []
     map_seconds: dict[str, float] = {}
+    weights: dict[str, str] = {}
 
 
 def write_run(path: Path, run: Run, *, force: bool = False) -> None:
@@ -91,7 +98,7 @@ def write_run(path: Path, run: Run, *, force: bool = False) -> None:
         head = _RunFile(
             1, protocols.to_dict(run.protocol), run.map_digest, run.tags_digest, list(run.recordings), run.seed,
             dict(run.versions), list(run.sessions), list(run.excluded), list(run.corrections),
-            dict(run.map_seconds),
+            dict(run.map_seconds), dict(run.weights),
         )  # fmt: skip
         write_table(folder / "trials.csv", TRIALS, (_trial_cells(t) for t in run.trials))
         write_table(folder / "estimates.csv", ESTIMATES, (_result_cells(r) for r in run.results))
@@ -113,10 +120,10 @@ def read_run(path: Path) -> Run:
         raise StoreError(f"{path}: not a run folder; expected run.json in it", hint="make one with `fieldkit replay`")
     head = read_json(path / "run.json", _RunFile, what="run.json of a run folder")
     protocol = protocols.from_dict(head.protocol, source=f"{path / 'run.json'}: protocol")
-    utilities, plan_view = _read_arrays(path)
+    utilities, reasons, plan_view = _read_arrays(path)
     trials = tuple(read_table(path / "trials.csv", TRIALS, _trial))
-    plans = _read_plans(path, utilities)
-    _check_complete(path, trials, plans, protocol)
+    plans = _read_plans(path, utilities, reasons)
+    _check_complete(path, trials, plans, protocol, excluded={e.what for e in head.excluded})
     return Run(
         protocol=protocol,
         map_digest=head.map_digest,
@@ -136,6 +143,7 @@ def read_run(path: Path) -> Run:
         tags=read_tags(path / TAGS_FILE) if (path / TAGS_FILE).is_file() else None,
         corrections=tuple(head.corrections),
         map_seconds=head.map_seconds,
+        weights=head.weights,
     )
 
 
@@ -151,13 +159,16 @@ def _write_tags(folder: Path, run: Run) -> None:
 
 
 def _check_complete(
-    path: Path, trials: Sequence[Trial], plans: Sequence[VisitPlan], protocol: protocols.Protocol
+    path: Path, trials: Sequence[Trial], plans: Sequence[VisitPlan], protocol: protocols.Protocol, *, excluded: set[str]
 ) -> None:
-    """Raise StoreError when trials.csv lacks a policy of the protocol at a visit: rows were lost."""
+    """Raise StoreError when trials.csv lacks a policy of the protocol at a visit: rows were lost.
+
+    A policy that was excluded by its name, since it has no weights, has no rows.
+    """
     there = {(t.session, t.visit, t.policy) for t in trials}
     for plan in plans:
         for policy in protocol.policies:
-            if (plan.session, plan.prior.visit, policy) not in there:
+            if policy not in excluded and (plan.session, plan.prior.visit, policy) not in there:
                 raise StoreError(
                     f"{path / 'trials.csv'}: has no row of {policy} at {plan.session}/{plan.prior.visit}; expected "
                     "every policy at every visit",
@@ -279,9 +290,7 @@ def _candidate_cells(p: VisitPlan) -> list[dict[str, object]]:
     ]
 
 
-def _read_plans(path: Path, utilities: dict[tuple[str, str], dict[tuple[str, bool | None], Any]]) -> tuple[
-    VisitPlan, ...
-]:  # fmt: skip
+def _read_plans(path: Path, utilities: ByVisit[Array], reasons: ByVisit[Reason]) -> tuple[VisitPlan, ...]:
     rows = read_table(path / "candidates.csv", CANDIDATES, dict)
     plans = []
     for session, prior, error in read_table(path / "priors.csv", PRIORS, _prior):
@@ -292,7 +301,8 @@ def _read_plans(path: Path, utilities: dict[tuple[str, str], dict[tuple[str, boo
             raise StoreError(
                 f"{path / 'candidates.csv'}: visit {prior.visit}: {error_}", hint="replay the recording again"
             ) from error_
-        plans.append(VisitPlan(session, prior, error, candidates, utilities.get((session, prior.visit), {})))
+        key = session, prior.visit
+        plans.append(VisitPlan(session, prior, error, candidates, utilities.get(key, {}), reasons.get(key, {})))
     return tuple(plans)
 
 
@@ -308,31 +318,49 @@ def _candidates(visit: str, rows: list[dict[str, str]]) -> Candidates:
 
 
 def _write_arrays(folder: Path, run: Run) -> None:
-    arrays = {}
+    utilities: dict[str, NDArray[Any]] = {}
+    reasons: dict[str, NDArray[Any]] = {}
     for plan in run.plans:
-        for (policy, occlusion), values in plan.utilities.items():
-            arrays[json.dumps([plan.session, plan.prior.visit, policy, occlusion])] = values
-    for name, content in (
-        ("utilities.npz", arrays),
-        ("plan.npz", {"landmarks": run.plan_view.landmarks, "cameras": run.plan_view.cameras}),
-    ):
+        place = [plan.session, plan.prior.visit]
+        for variant, values in plan.utilities.items():
+            utilities[json.dumps([*place, *variant])] = values
+        for variant, reason in plan.reasons.items():
+            rows = np.column_stack([reason.landmarks, reason.raised]).astype(np.float32)
+            reasons[json.dumps([*place, *variant, reason.view])] = rows
+    contents: dict[str, dict[str, NDArray[Any]]] = {
+        "utilities.npz": utilities,
+        "plan.npz": {"landmarks": run.plan_view.landmarks, "cameras": run.plan_view.cameras},
+        **({REASONS_FILE: reasons} if reasons else {}),
+    }
+    for name, content in contents.items():
         # Keys go into the archive as member names: quoted, so that a session's name cannot act as a path.
         stream = io.BytesIO()
         np.savez_compressed(stream, allow_pickle=False, **{quote(k, safe=""): v for k, v in content.items()})
         atomic_write(folder / name, stream.getvalue())
 
 
-def _read_arrays(path: Path) -> tuple[dict[tuple[str, str], dict[tuple[str, bool | None], Any]], PlanView]:
-    utilities: dict[tuple[str, str], dict[tuple[str, bool | None], Any]] = {}
+def _read_arrays(path: Path) -> tuple[ByVisit[Array], ByVisit[Reason], PlanView]:
+    utilities: ByVisit[Array] = {}
+    reasons: ByVisit[Reason] = {}
     try:
         with np.load(path / "utilities.npz", allow_pickle=False) as archive:
             for key in archive.files:
                 session, visit, policy, occlusion = json.loads(unquote(key))
                 utilities.setdefault((session, visit), {})[(policy, occlusion)] = archive[key]
+        if (path / REASONS_FILE).is_file():
+            with np.load(path / REASONS_FILE, allow_pickle=False) as archive:
+                for key in archive.files:
+                    session, visit, policy, occlusion, view = json.loads(unquote(key))
+                    rows = archive[key].reshape(-1, 4)
+                    reasons.setdefault((session, visit), {})[(policy, occlusion)] = Reason(
+                        view, rows[:, :3], rows[:, 3]
+                    )
         with np.load(path / "plan.npz", allow_pickle=False) as archive:
-            return utilities, PlanView(archive["landmarks"], archive["cameras"])
+            return utilities, reasons, PlanView(archive["landmarks"], archive["cameras"])
     except (OSError, KeyError, ValueError) as error:
-        raise StoreError(f"{path}: utilities.npz or plan.npz: {error}", hint="replay the recording again") from error
+        raise StoreError(
+            f"{path}: utilities.npz, {REASONS_FILE} or plan.npz: {error}", hint="replay the recording again"
+        ) from error
 
 
 def _write_poses(folder: Path, run: Run) -> None:

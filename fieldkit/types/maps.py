@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ class SceneMap:
     ``descriptor_image`` int32[d]; a compact map has one per landmark.
     ``retrieval``: the network that made ``image_vectors`` f32[k, w], unit vectors of whole mapping images; None where
     images are compared by their landmarks' descriptors.
+    ``appearance``: what networks of appearance see at the landmarks, f16[n, width] by the network's name.
     """
 
     path: str
@@ -53,6 +55,7 @@ class SceneMap:
     surface: Surface | None = None
     retrieval: str | None = None
     image_vectors: NDArray[np.float32] | None = None
+    appearance: Mapping[str, NDArray[np.float16]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)

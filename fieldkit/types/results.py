@@ -123,10 +123,23 @@ class ViewResult:
 
 
 @dataclasses.dataclass(frozen=True)
+class Reason:
+    """What a learned score of a view rests on: k landmarks f32[k, 3] (m, in the map), and how much each raised it.
+
+    ``raised`` f32[k]: the view's log-odds to localize, minus those without this one landmark; negative: it lowered it.
+    """
+
+    view: str
+    landmarks: NDArray[np.float32]
+    raised: NDArray[np.float32]
+
+
+@dataclasses.dataclass(frozen=True)
 class VisitPlan:
     """What was known at a visit before looking: prior, candidates, and every policy's utility per candidate.
 
-    ``utilities`` maps (policy, occlusion) to f64[v]; -inf is not allowed, never nan.
+    ``utilities`` maps (policy, occlusion) to f64[v]; -inf is not allowed, never nan. ``reasons`` are those of learned
+    policies, for the view that each prefers.
     """
 
     session: str
@@ -134,6 +147,7 @@ class VisitPlan:
     prior_error: tuple[float, float]
     candidates: Candidates
     utilities: Mapping[tuple[str, bool | None], Array]
+    reasons: Mapping[tuple[str, bool | None], Reason] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +180,8 @@ class Run:
     """A finished replay: everything that scoring and the report need, without images, bag or map.
 
     ``tags`` are those it was replayed with, None where it needed none or an older run does not hold them.
-    ``map_seconds`` are those of building the map, per stage, where the map says so.
+    ``map_seconds`` are those of building the map, per stage, where the map says so. ``weights`` are the digests of the
+    learned policies' checkpoints.
     """
 
     protocol: Protocol
@@ -187,3 +202,4 @@ class Run:
     tags: TagMap | None = None
     corrections: tuple[Applied, ...] = ()
     map_seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    weights: Mapping[str, str] = dataclasses.field(default_factory=dict)

@@ -64,6 +64,14 @@ class SeenLandmarks:
     angle_rad: Floats
     off_mean_rad: Floats
 
+    def without(self, index: int) -> SeenLandmarks:
+        """Return all but one of the landmarks."""
+        return self.rows(np.delete(np.arange(len(self.landmark)), index))
+
+    def rows(self, rows: NDArray[np.integer]) -> SeenLandmarks:
+        """Return some of the landmarks."""
+        return SeenLandmarks(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
+
 
 def seen_landmarks(
     visible: Visibility, candidates: Candidates, *, statistics: LandmarkStatistics
@@ -112,8 +120,7 @@ def thinned(seen: SeenLandmarks, *, cap: int, seed: int = 0) -> SeenLandmarks:
     """
     if len(seen.landmark) <= cap:
         return seen
-    keep = np.sort(np.argpartition(_ranks(seen.landmark, seed), cap)[:cap])
-    return SeenLandmarks(*(getattr(seen, f.name)[keep] for f in dataclasses.fields(seen)))
+    return seen.rows(np.sort(np.argpartition(_ranks(seen.landmark, seed), cap)[:cap]))
 
 
 def _ranks(landmark: NDArray[np.int32], seed: int) -> NDArray[np.uint64]:
@@ -150,7 +157,7 @@ def landmark_tokens(
     tokens[:, 5] = statistics.max_angle_rad[i] / np.pi
     tokens[:, 6] = seen.off_mean_rad / np.pi
     tokens[:, 7:9] = seen.uv_px / (camera.width, camera.height)
-    tokens[:, 9:TOKEN_WIDTH] = _log_share(heat_maps.counts(i).reshape(len(i), -1), FULL_OBSERVATIONS)
+    tokens[:, 9:TOKEN_WIDTH] = _log_share(heat_maps.counts(i).reshape(len(i), HEAT_CELLS**2), FULL_OBSERVATIONS)
     if appearance is not None:
         tokens[:, TOKEN_WIDTH:] = appearance[i]
     return np.clip(tokens, 0.0, 1.0, out=tokens)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,29 +44,35 @@ def landmark_statistics(scene_map: SceneMap) -> LandmarkStatistics:
 
 
 class HeatMaps:
-    """Where in their images the mapping cameras saw each landmark of a map; made once per map, a byte an observation.
+    """Where in their images the mapping cameras saw each landmark of a map; made once per map and when first asked for.
 
     Rows of a heat map go down the image and columns to the right.
     """
 
     def __init__(self, scene_map: SceneMap, *, cells: int = HEAT_CELLS) -> None:
-        sizes = np.array([(c.width, c.height) for c in scene_map.image_cameras], dtype=np.float32).reshape(-1, 2)
-        place = scene_map.observation_px / sizes[scene_map.observation_image]
+        self._map, self._cells = scene_map, cells
+
+    @functools.cached_property
+    def _rows(self) -> tuple[NDArray[np.int64], NDArray[np.integer]]:
+        """Where each landmark's observations begin and end, and the cells of all observations in that order."""
+        known, cells = self._map, self._cells
+        sizes = np.array([(c.width, c.height) for c in known.image_cameras], dtype=np.float32).reshape(-1, 2)
+        place = known.observation_px / sizes[known.observation_image]
         column, line = np.clip((place * cells).astype(np.int32), 0, cells - 1).T
-        order = np.argsort(scene_map.observation_landmark, kind="stable")
-        counts = np.bincount(scene_map.observation_landmark, minlength=len(scene_map.xyz))
-        self._cells = cells
-        self._cell = (line * cells + column).astype(np.uint8 if cells <= 16 else np.int32)[order]
-        self._starts = np.concatenate([[0], np.cumsum(counts)])
+        counts = np.bincount(known.observation_landmark, minlength=len(known.xyz))
+        order = np.argsort(known.observation_landmark, kind="stable")
+        cell = (line * cells + column).astype(np.uint8 if cells <= 16 else np.int32)
+        return np.concatenate([[0], np.cumsum(counts)]), cell[order]
 
     def counts(self, landmarks: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return int64[k, cells, cells]: how many mapping images saw each of some landmarks (k) in each cell."""
-        begin, end = self._starts[landmarks], self._starts[np.asarray(landmarks) + 1]
+        starts, cell = self._rows
+        begin, end = starts[landmarks], starts[np.asarray(landmarks) + 1]
         number = end - begin
         owner = np.repeat(np.arange(len(number)), number)
         within = np.arange(len(owner)) - np.repeat(np.cumsum(number) - number, number)
         size = self._cells**2
-        index = owner * size + self._cell[begin[owner] + within]
+        index = owner * size + cell[begin[owner] + within]
         counted = np.bincount(index, minlength=len(number) * size)
         return counted.reshape(len(number), self._cells, self._cells)
 

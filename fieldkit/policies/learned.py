@@ -1,0 +1,187 @@
+"""Learned policies: the probability that a view localizes, by a network trained on other buildings."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.errors import PolicyError, WeightsError
+from fieldkit.learned.checkpoint import About, Checkpoint, read_checkpoint
+from fieldkit.learned.scoring import Scorer
+from fieldkit.policies.scene import Scene
+from fieldkit.types import Excluded, SceneMap
+from fieldkit.views import SeenLandmarks, landmark_tokens, seen_landmarks, thinned, view_histograms
+
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+LEARNED = ("mlp", "vpt", "vpt_dino", "vpt_appearance")
+SUFFIX = ".safetensors"
+# As many landmarks of a view are left out one by one to see what its score rests on.
+_ASKED = 512
+_GIVE = "train it with `fieldkit train`, and name the file with --policy-weights"
+
+
+def shipped_weights() -> Path:
+    """Return the folder of the weights that come with fieldkit."""
+    return Path(__file__).parent / "weights"
+
+
+def shipped(name: str) -> Checkpoint:
+    """Read the shipped weights of a learned policy; raises PolicyError when there are none."""
+    path = shipped_weights() / f"{name}{SUFFIX}"
+    if not path.is_file():
+        raise PolicyError(f"policy {name!r} has no weights in this version", hint=_GIVE)
+    return _checkpoint(path, name)
+
+
+def find_checkpoints(
+    names: Sequence[str], *, given: Path | None = None
+) -> tuple[dict[str, Checkpoint], tuple[Excluded, ...]]:
+    """Return the checkpoints of those policies among ``names`` that are learned, and which of them have none.
+
+    ``given`` is a checkpoint of any name or a folder of them; it says itself which policy it is of. It goes before
+    what is shipped. Raises WeightsError when it is missing, damaged, holds two of one policy, or none of ``names``.
+    """
+    own = {} if given is None else _given(Path(given))
+    wanted = [name for name in names if name in LEARNED]
+    if given is not None and not any(name in own for name in wanted):
+        raise WeightsError(
+            f"{given}: has weights of {', '.join(own) or 'no policy'}; expected those of one that the protocol names: "
+            f"{', '.join(wanted) or 'it has no learned policy'}",
+            hint="check --policy-weights and the protocol's policies",
+        )
+    found: dict[str, Checkpoint] = {}
+    missing: list[Excluded] = []
+    for name in wanted:
+        if name in own:
+            found[name] = own[name]
+        elif (shipped_weights() / f"{name}{SUFFIX}").is_file():
+            found[name] = shipped(name)
+        else:
+            missing.append(Excluded(name, f"has no weights in this version; {_GIVE}"))
+    return found, tuple(missing)
+
+
+def _given(path: Path) -> dict[str, Checkpoint]:
+    """Return the checkpoints of a file or folder by policy."""
+    if not path.exists():
+        raise WeightsError(f"{path}: no such file; expected a checkpoint or a folder of them", hint="check the path")
+    files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+    result: dict[str, Checkpoint] = {}
+    for file in files:
+        checkpoint = read_checkpoint(file)
+        kind = checkpoint.about.kind
+        if kind in result:
+            raise WeightsError(
+                f"{path}: {Path(result[kind].path).name} and {file.name} are both of the policy {kind}; expected one",
+                hint="name the file that is meant",
+            )
+        result[kind] = checkpoint
+    return result
+
+
+def _checkpoint(path: Path, name: str) -> Checkpoint:
+    checkpoint = read_checkpoint(path)
+    if checkpoint.about.kind != name:
+        raise WeightsError(f"{path}: is of the policy {checkpoint.about.kind}; expected {name}", hint="install again")
+    return checkpoint
+
+
+def without_appearance(scene_map: SceneMap, checkpoint: Checkpoint) -> Excluded | None:
+    """Say why a map cannot serve a checkpoint: it lacks the appearance of its landmarks; None where it can."""
+    network = checkpoint.about.appearance
+    if network is None or network in scene_map.appearance:
+        return None
+    return Excluded(
+        checkpoint.about.kind,
+        f"{scene_map.path} lacks the appearance {network} of its landmarks; add it with `fieldkit map appearance`",
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Learned:
+    """A learned policy with its weights in a map: the probability that a view localizes.
+
+    ``appearance`` f32[n, 3] of the map's landmarks, reduced, where the policy uses it.
+    """
+
+    scorer: Scorer
+    appearance: Floats | None = None
+
+    @property
+    def about(self) -> About:
+        """What the weights were trained on, and how they score."""
+        return self.scorer.checkpoint.about
+
+    def __call__(self, scene: Scene) -> Array:
+        """Return the score of each view, f64[v] in 0..1, -inf where not allowed."""
+        allowed = np.flatnonzero(scene.candidates.allowed)
+        seen = self._seen(scene)
+        result = np.full(len(seen), -np.inf)
+        result[allowed] = self.scorer.scores([self._features(scene, seen[i]) for i in allowed])
+        return result
+
+    def raised(self, scene: Scene, view: int) -> tuple[NDArray[np.int32], Floats]:
+        """Return landmarks int32[k] of a view, and how much each raised its score, f32[k].
+
+        That is the view's log-odds to localize, minus those if just this landmark were not seen: negative for one
+        that lowered the score. Of a view with more than 512 landmarks to score, 512 are asked for.
+        """
+        seen = self._seen(scene)[view]
+        asked = np.flatnonzero(np.isin(seen.landmark, thinned(seen, cap=_ASKED).landmark))
+        everything = self._features(scene, seen)
+        if self.about.kind == "mlp":
+            without = [self._features(scene, seen.without(int(i))) for i in asked]
+        else:
+            without = [np.delete(everything, i, axis=0) for i in asked]
+        log_odds = self.scorer.log_odds([everything, *without])
+        return seen.landmark[asked], (log_odds[0] - log_odds[1:]).astype(np.float32)
+
+    def _seen(self, scene: Scene) -> list[SeenLandmarks]:
+        """Return what each view sees, no more than the weights were trained to look at."""
+        views = seen_landmarks(scene.visible, scene.candidates, statistics=scene.statistics)
+        cap = self.about.landmark_cap
+        return list(views) if cap is None else [thinned(seen, cap=cap) for seen in views]
+
+    def _features(self, scene: Scene, seen: SeenLandmarks) -> Floats:
+        camera = scene.candidates.camera
+        if self.about.kind == "mlp":
+            return view_histograms(seen, scene.statistics, camera=camera)
+        return landmark_tokens(
+            seen, scene.statistics, heat_maps=scene.heat_maps, camera=camera, appearance=self.appearance
+        )
+
+
+def open_learned(checkpoint: Checkpoint, scene_map: SceneMap) -> Learned:
+    """Open a checkpoint for a map, with a warning where the map has other features than it was trained with.
+
+    Raises WeightsError where the weights do not fit their network, PolicyError where the map lacks appearance.
+    """
+    about = checkpoint.about
+    lacking = without_appearance(scene_map, checkpoint)
+    if lacking is not None:
+        raise PolicyError(f"policy {lacking.what!r}: {lacking.reason}")
+    if about.feature != scene_map.feature:
+        log.warning(
+            "%s: made with feature %s; the weights of %s were trained with %s: scores may be less sure here",
+            scene_map.path,
+            scene_map.feature,
+            about.kind,
+            about.feature,
+        )
+    scorer = Scorer(checkpoint)
+    if about.appearance is None:
+        return Learned(scorer)
+    assert checkpoint.reduction is not None
+    return Learned(scorer, checkpoint.reduction(scene_map.appearance[about.appearance]))
+
+
+def score_shipped(name: str, scene: Scene) -> Array:
+    """Return the scores of a shipped policy that uses no appearance; f64[v], -inf where not allowed."""
+    return Learned(Scorer(shipped(name)))(scene)
