@@ -147,7 +147,9 @@ def read_examples(scene: SceneFolder, *, progress: Progress | None = None) -> Ex
         if progress is not None:
             progress(f"read {scene.name}", number + 1, len(scene.entry.waypoints))
     if camera is None or not parts:
-        raise DatasetError(f"{scene.folder}: the scene {scene.name!r} has no views; expected some", hint="make it again")
+        raise DatasetError(
+            f"{scene.folder}: the scene {scene.name!r} has no views; expected some", hint="make it again"
+        )
     counts = [len(p.occluded) for p in parts]
     return Examples(
         scene=scene.name,
