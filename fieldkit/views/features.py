@@ -31,8 +31,9 @@ FULL_DISTANCE_M = 5.0
 FULL_OBSERVATIONS, FULL_LANDMARKS = 32, 4096
 # Angles to the principal axis beyond this (corners of a wide mapping camera) share the last bin.
 FULL_ANGLE_DEG = 60.0
-# Bins of how far outside the mapped range a landmark is seen; those inside it are in the middle of the fifth.
-OUTSIDE_BIN_M, OUTSIDE_BIN_DEG, _INSIDE_BIN = 0.5, 6.0, 4.5
+# How far the view is from mapping's: halvings or doublings of the distance to either side, and the angle at the
+# landmark. In validation the angle at the landmark tells far more than that in the camera's frame.
+FULL_OCTAVES, FULL_OFF_DEG = 2.0, 90.0
 # A direction exactly on the border of the mapped range counts, whatever the last bits of its angle are.
 ANGLE_SLACK_RAD = 1e-6
 
@@ -44,8 +45,8 @@ def normalisation() -> dict[str, float]:
         "full_observations": FULL_OBSERVATIONS,
         "full_landmarks": FULL_LANDMARKS,
         "full_angle_deg": FULL_ANGLE_DEG,
-        "outside_bin_m": OUTSIDE_BIN_M,
-        "outside_bin_deg": OUTSIDE_BIN_DEG,
+        "full_octaves": FULL_OCTAVES,
+        "full_off_deg": FULL_OFF_DEG,
     }
 
 
@@ -168,10 +169,10 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
 
     0 all landmarks; 1 those seen from a direction from which mapping saw them (at the landmark, as the policy "angle"
     counts); 2..41 histograms of ten bins: smallest and largest distance of mapping over 0..5 m, smallest and largest
-    angle to the principal axis over 0..60 deg; 42..61 histograms of how far distance and angle of this view are
-    outside those of mapping: below the smallest (negative), above the largest (positive), 0 between, bins of 0.5 m
-    and 6 deg of which the fifth is centred on 0; 62..125 image positions in 8x8 cells, row by row; 126..145
-    histograms of u and v. What lies beyond the bins counts in the first or last.
+    angle to the principal axis over 0..60 deg; 42..61 histograms of how far the view is from those of mapping: its
+    distance over the geometric mean of smallest and largest, from a quarter to four times in logarithmic bins, and the
+    angle at the landmark off the mean mapping direction over 0..90 deg; 62..125 image positions in 8x8 cells, row by
+    row; 126..145 histograms of u and v. What lies beyond the bins counts in the first or last.
     """
     i = seen.landmark
     nearest, farthest = statistics.min_distance_m[i], statistics.max_distance_m[i]
@@ -184,8 +185,8 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
         BINS * farthest / FULL_DISTANCE_M,
         BINS * least / np.radians(FULL_ANGLE_DEG),
         BINS * most / np.radians(FULL_ANGLE_DEG),
-        _INSIDE_BIN + _outside(seen.distance_m, nearest, farthest) / OUTSIDE_BIN_M,
-        _INSIDE_BIN + _outside(seen.angle_rad, least, most) / np.radians(OUTSIDE_BIN_DEG),
+        BINS * (0.5 + _octaves(seen.distance_m, nearest, farthest) / (2.0 * FULL_OCTAVES)),
+        BINS * seen.off_mean_rad / np.radians(FULL_OFF_DEG),
         line * cells + column,
         BINS * u,
         BINS * v,
@@ -198,9 +199,10 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
     return _log_share(np.concatenate(counts), FULL_LANDMARKS)
 
 
-def _outside(value: Floats, low: Array, high: Array) -> Array:
-    """Return by how much values are below (negative) or above a range, 0 where they are inside."""
-    return np.asarray(np.minimum(value - low, 0.0) + np.maximum(value - high, 0.0), dtype=np.float64)
+def _octaves(distance: Floats, nearest: Array, farthest: Array) -> Array:
+    """Return how often a distance has to be halved to be the geometric mean of those of mapping; negative if nearer."""
+    small = 1e-3
+    return np.asarray(np.log2(np.maximum(distance, small)) - 0.5 * np.log2(np.maximum(nearest * farthest, small**2)))
 
 
 def _log_share(counts: NDArray[np.integer], full: int) -> Floats:
