@@ -61,11 +61,9 @@ class _Attention(nn.Module):
         self.out = nn.Linear(_WIDTH, _WIDTH)
         self.norm = _Norm(_WIDTH)
 
-    def forward(self, x: Tensor, there: Tensor | None) -> Tensor:
-        key = self.key(x) * _KEY_WIDTH**-0.25
-        energy = key @ key.transpose(1, 2)
-        if there is not None:
-            energy = energy.masked_fill(~there[:, None], -torch.inf)
+    def forward(self, x: Tensor, bias: Tensor, there: Tensor | None) -> Tensor:
+        key = self.key(x)
+        energy = torch.baddbmm(bias[:, None], key, key.transpose(1, 2), alpha=_KEY_WIDTH**-0.5)
         mixed = energy.softmax(dim=2) @ self.value(x)
         return x + torch.relu(self.norm(self.out(mixed), there))
 
@@ -74,7 +72,8 @@ class Vpt(nn.Module):
     """The paper's viewpoint transformer: logits f32[b, 2] of landmark tokens f32[b, n, 73]; 159,170 weights.
 
     With the three numbers of appearance, ``tokens=76``, it has 159,554. Tokens have no order: logits stay the same
-    when they are permuted.
+    when they are permuted. A token of weight w counts in the attention as w equal tokens would (the logarithm of w is
+    added to its energy), so that few tokens can stand for many without another result.
     """
 
     def __init__(self, *, tokens: int = TOKEN_WIDTH, dropout: float = 0.4) -> None:
@@ -89,21 +88,22 @@ class Vpt(nn.Module):
             nn.Linear(64, 2),
         )  # fmt: skip
 
-    def forward(self, tokens: Tensor, there: Tensor | None = None) -> Tensor:
-        """Return logits f32[b, 2] of tokens f32[b, n, c]; ``there`` bool[b, n] is false where a row only fills up.
+    def forward(self, tokens: Tensor, weight: Tensor | None = None) -> Tensor:
+        """Return logits f32[b, 2] of tokens f32[b, n, c] with weights f32[b, n], 0 where a row only fills up.
 
-        Every view needs a token that is there: `padded` gives a view that sees nothing one of zeros.
+        Every view needs a token of some weight; without weights every one counts once.
         """
-        pooled = self.landmark_features(tokens, there).amax(dim=1)
-        logits: Tensor = self.head(pooled)
+        logits: Tensor = self.head(self.landmark_features(tokens, weight).amax(dim=1))
         return logits
 
-    def landmark_features(self, tokens: Tensor, there: Tensor | None = None) -> Tensor:
-        """Return what the max pool sees of each landmark, f32[b, n, 128]; -inf where no token is."""
+    def landmark_features(self, tokens: Tensor, weight: Tensor | None = None) -> Tensor:
+        """Return what the max pool sees of each token, f32[b, n, 128]; -inf where no token is."""
         x = self.embedding(tokens)
+        bias = tokens.new_zeros(tokens.shape[:2]) if weight is None else weight.log()
+        there = None if weight is None or bool((weight > 0).all()) else weight > 0
         parts = []
         for attention in self.attention:
-            x = attention(x, there)
+            x = attention(x, bias, there)
             parts.append(x)
         y = nn.functional.leaky_relu(self.joint_norm(self.joint(torch.cat(parts, dim=2)), there), 0.2)
         return y if there is None else y.masked_fill(~there[..., None], -torch.inf)

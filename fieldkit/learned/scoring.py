@@ -57,32 +57,35 @@ class Scorer:
         self._width = token_width(checkpoint)
         self._network = open_network(checkpoint)
 
-    def scores(self, views: Sequence[Floats]) -> Array:
+    def scores(self, views: Sequence[Floats], *, visible: Sequence[int] | None = None) -> Array:
         """Return for each view the probability f64[v] that it localizes.
 
-        ``views`` are histograms f32[146] for an MLP, else tokens f32[k, 73 or 76] of landmarks, k may be 0.
+        ``views`` are histograms f32[146] for an MLP, else tokens f32[k, 73 or 76] of landmarks, k may be 0. ``visible``
+        is how many landmarks each view sees where its tokens are of some of them only.
         """
-        return 1.0 / (1.0 + np.exp(-self.log_odds(views)))
+        return 1.0 / (1.0 + np.exp(-self.log_odds(views, visible=visible)))
 
-    def log_odds(self, views: Sequence[Floats]) -> Array:
+    def log_odds(self, views: Sequence[Floats], *, visible: Sequence[int] | None = None) -> Array:
         """Return the logarithm f64[v] of each view's odds to localize; see `scores`."""
         import torch
 
         result = np.empty(len(views), dtype=np.float64)
         about = self.checkpoint.about
         with torch.inference_mode():
-            for members, inputs in self._batches(views):
+            for members, inputs in self._batches(views, [len(v) for v in views] if visible is None else visible):
                 logits = self._network(*map(torch.from_numpy, inputs)).double()
                 result[members] = ((logits[:, 1] - logits[:, 0]) / about.temperature + about.bias).numpy()
         return result
 
-    def _batches(self, views: Sequence[Floats]) -> Iterator[tuple[NDArray[np.int64], tuple[NDArray[np.generic], ...]]]:
+    def _batches(
+        self, views: Sequence[Floats], visible: Sequence[int]
+    ) -> Iterator[tuple[NDArray[np.int64], tuple[Floats, ...]]]:
         """Yield batches with the indices of their views: of nearly the same length, so that little is filled up."""
         if self._width is None:
             if len(views):
                 yield np.arange(len(views)), (np.stack(views).reshape(len(views), HISTOGRAM_WIDTH),)
             return
-        lengths = np.array([max(len(v), 1) for v in views], dtype=np.int64)
+        lengths = np.array([len(v) + 1 for v in views], dtype=np.int64)
         order = np.argsort(lengths, kind="stable")
         start = 0
         while start < len(order):
@@ -90,6 +93,6 @@ class Scorer:
             while stop < len(order) and (stop + 1 - start) * lengths[order[stop]] ** 2 <= _MOST_PAIRS:
                 stop += 1
             members = order[start:stop]
-            tokens, there = padded([views[i] for i in members], width=self._width)
-            yield members, (tokens,) if there.all() else (tokens, there)
+            chosen = [views[i] for i in members]
+            yield members, padded(chosen, visible=[visible[i] for i in members], width=self._width)
             start = stop

@@ -124,7 +124,8 @@ class Learned:
         allowed = np.flatnonzero(scene.candidates.allowed)
         seen = self._seen(scene)
         result = np.full(len(seen), -np.inf)
-        result[allowed] = self.scorer.scores([self._features(scene, seen[i]) for i in allowed])
+        features = [self._features(scene, seen[i]) for i in allowed]
+        result[allowed] = self.scorer.scores(features, visible=[seen[i].visible for i in allowed])
         return result
 
     def raised(self, scene: Scene, view: int) -> tuple[NDArray[np.int32], Floats]:
@@ -140,7 +141,8 @@ class Learned:
             without = [self._features(scene, seen.without(int(i))) for i in asked]
         else:
             without = [np.delete(everything, i, axis=0) for i in asked]
-        log_odds = self.scorer.log_odds([everything, *without])
+        visible = [seen.visible, *(len(asked) * [seen.visible - 1])]
+        log_odds = self.scorer.log_odds([everything, *without], visible=visible)
         return seen.landmark[asked], (log_odds[0] - log_odds[1:]).astype(np.float32)
 
     def _seen(self, scene: Scene) -> list[SeenLandmarks]:

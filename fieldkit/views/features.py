@@ -31,9 +31,8 @@ FULL_DISTANCE_M = 5.0
 FULL_OBSERVATIONS, FULL_LANDMARKS = 32, 4096
 # Angles to the principal axis beyond this (corners of a wide mapping camera) share the last bin.
 FULL_ANGLE_DEG = 60.0
-# How far the view is from mapping's: halvings or doublings of the distance to either side, and the angle at the
-# landmark. In validation the angle at the landmark tells far more than that in the camera's frame.
-FULL_OCTAVES, FULL_OFF_DEG = 2.0, 90.0
+# How much nearer or farther than mapping a view is, and how far off the mean mapping direction: what the bins span.
+FULL_OCTAVES, FULL_OFF_MEAN_DEG = 2.0, 90.0
 # A direction exactly on the border of the mapped range counts, whatever the last bits of its angle are.
 ANGLE_SLACK_RAD = 1e-6
 
@@ -46,7 +45,7 @@ def normalisation() -> dict[str, float]:
         "full_landmarks": FULL_LANDMARKS,
         "full_angle_deg": FULL_ANGLE_DEG,
         "full_octaves": FULL_OCTAVES,
-        "full_off_deg": FULL_OFF_DEG,
+        "full_off_mean_deg": FULL_OFF_MEAN_DEG,
     }
 
 
@@ -56,7 +55,8 @@ class SeenLandmarks:
 
     ``landmark`` int32[k] index in the map; ``uv_px`` f32[k, 2]; ``distance_m`` f32[k] from the camera; ``angle_rad``
     f32[k] between the viewing ray and the principal axis; ``off_mean_rad`` f32[k], at the landmark, between the
-    direction to the camera and the mean direction from which mapping saw it.
+    direction to the camera and the mean direction from which mapping saw it. ``visible`` is how many the view would
+    see before some were chosen among them.
     """
 
     landmark: NDArray[np.int32]
@@ -64,14 +64,23 @@ class SeenLandmarks:
     distance_m: Floats
     angle_rad: Floats
     off_mean_rad: Floats
+    visible: int
 
     def without(self, index: int) -> SeenLandmarks:
-        """Return all but one of the landmarks."""
-        return self.rows(np.delete(np.arange(len(self.landmark)), index))
+        """Return what would be seen if one of the landmarks were not there."""
+        left = self.rows(np.delete(np.arange(len(self.landmark)), index))
+        return dataclasses.replace(left, visible=self.visible - 1)
 
     def rows(self, rows: NDArray[np.integer]) -> SeenLandmarks:
-        """Return some of the landmarks."""
-        return SeenLandmarks(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
+        """Return some of the landmarks, chosen among all."""
+        return SeenLandmarks(
+            self.landmark[rows],
+            self.uv_px[rows],
+            self.distance_m[rows],
+            self.angle_rad[rows],
+            self.off_mean_rad[rows],
+            self.visible,
+        )
 
 
 def seen_landmarks(
@@ -110,6 +119,7 @@ def _seen(
         distance_m=distance.astype(np.float32),
         angle_rad=np.arccos(np.clip(ray[:, 2], -1.0, 1.0)).astype(np.float32),
         off_mean_rad=np.arccos(np.clip(towards, -1.0, 1.0)).astype(np.float32),
+        visible=len(landmark),
     )
 
 
@@ -169,14 +179,15 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
 
     0 all landmarks; 1 those seen from a direction from which mapping saw them (at the landmark, as the policy "angle"
     counts); 2..41 histograms of ten bins: smallest and largest distance of mapping over 0..5 m, smallest and largest
-    angle to the principal axis over 0..60 deg; 42..61 histograms of how far the view is from those of mapping: its
-    distance over the geometric mean of smallest and largest, from a quarter to four times in logarithmic bins, and the
-    angle at the landmark off the mean mapping direction over 0..90 deg; 62..125 image positions in 8x8 cells, row by
-    row; 126..145 histograms of u and v. What lies beyond the bins counts in the first or last.
+    angle to the principal axis over 0..60 deg; 42..51 the view's distance against that of mapping, as octaves of
+    distance / sqrt(smallest * largest) over -2..2; 52..61 its angle against that of mapping, at the landmark off the
+    mean direction, over 0..90 deg; 62..125 image positions in 8x8 cells, row by row; 126..145 histograms of u and v.
+    What lies beyond the bins counts in the first or last.
     """
     i = seen.landmark
     nearest, farthest = statistics.min_distance_m[i], statistics.max_distance_m[i]
     least, most = statistics.min_angle_rad[i], statistics.max_angle_rad[i]
+    octaves = np.log2(seen.distance_m / np.sqrt(nearest * farthest))
     u, v = (seen.uv_px / (camera.width, camera.height)).T
     cells = HEAT_CELLS
     column, line = (np.clip((x * cells).astype(np.int64), 0, cells - 1) for x in (u, v))
@@ -185,8 +196,8 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
         BINS * farthest / FULL_DISTANCE_M,
         BINS * least / np.radians(FULL_ANGLE_DEG),
         BINS * most / np.radians(FULL_ANGLE_DEG),
-        BINS * (0.5 + _octaves(seen.distance_m, nearest, farthest) / (2.0 * FULL_OCTAVES)),
-        BINS * seen.off_mean_rad / np.radians(FULL_OFF_DEG),
+        BINS * (octaves / FULL_OCTAVES + 1.0) / 2.0,
+        BINS * seen.off_mean_rad / np.radians(FULL_OFF_MEAN_DEG),
         line * cells + column,
         BINS * u,
         BINS * v,
@@ -197,12 +208,6 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
     for place, n in zip(places, bins, strict=True):
         counts.append(np.bincount(np.clip(place, 0, n - 1).astype(np.int64), minlength=n))
     return _log_share(np.concatenate(counts), FULL_LANDMARKS)
-
-
-def _octaves(distance: Floats, nearest: Array, farthest: Array) -> Array:
-    """Return how often a distance has to be halved to be the geometric mean of those of mapping; negative if nearer."""
-    small = 1e-3
-    return np.asarray(np.log2(np.maximum(distance, small)) - 0.5 * np.log2(np.maximum(nearest * farthest, small**2)))
 
 
 def _log_share(counts: NDArray[np.integer], full: int) -> Floats:
