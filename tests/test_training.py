@@ -105,14 +105,14 @@ def test_examples_are_the_features_of_the_shards(views: Path) -> None:
     for occlusion in (True, False):
         numbers = np.array([0, 71])
         (histograms,) = HistogramInputs([scene]).plain(numbers, occlusion=occlusion)
-        tokens, there = TokenInputs([scene], dataclasses.replace(QUICK, cap=4096)).plain(numbers, occlusion=occlusion)[
-            :2
-        ]
+        whole = TokenInputs([scene], dataclasses.replace(QUICK, cap=4096))
+        tokens, weight = whole.plain(numbers, occlusion=occlusion)
         for row, view in enumerate(numbers):
             seen = scene.view(int(view), occlusion=occlusion)
             assert (not occlusion) or (seen.landmark % 2 == 0).all()
             expected = landmark_tokens(seen, scene.statistics, heat_maps=scene.heat_maps, camera=scene.camera)
-            np.testing.assert_array_equal(tokens[row][there[row]], expected)
+            np.testing.assert_array_equal(tokens[row, : len(expected)], expected)
+            assert (weight[row, : len(expected)] == 1.0).all()
             np.testing.assert_array_equal(histograms[row], view_histograms(seen, scene.statistics, camera=scene.camera))
 
 
@@ -121,11 +121,11 @@ def test_views_in_a_mirror_are_those_of_a_mirrored_building(views: Path) -> None
 
     scene = read_examples(find_scenes([views])[0])
     inputs = TokenInputs([scene], QUICK)
-    tokens = np.array(inputs.plain(np.arange(4), occlusion=False)[0])
+    tokens = np.array(inputs.plain(np.arange(4), occlusion=False)[0]).reshape(-1, 73)
     mirrored = tokens.copy()
     _mirror(mirrored)
-    heat, other = (t[..., 9:].reshape(*t.shape[:2], 8, 8) for t in (tokens, mirrored))
-    np.testing.assert_allclose(mirrored[..., 7], 1.0 - tokens[..., 7])
+    heat, other = (t[:, 9:].reshape(-1, 8, 8) for t in (tokens, mirrored))
+    np.testing.assert_allclose(mirrored[:, 7], 1.0 - tokens[:, 7])
     np.testing.assert_array_equal(other[..., 0], heat[..., 7])
     _mirror(mirrored)
     np.testing.assert_allclose(mirrored, tokens, atol=1e-6)

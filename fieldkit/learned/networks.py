@@ -52,7 +52,7 @@ class _Norm(nn.BatchNorm1d):
 
 
 class _Attention(nn.Module):
-    """Self-attention with one projection for queries and keys, 32 wide, and a residual."""
+    """Offset attention (Guo et al., Point Cloud Transformer, 2021): one projection for queries and keys, 32 wide."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class _Attention(nn.Module):
         key = self.key(x)
         energy = torch.baddbmm(bias[:, None], key, key.transpose(1, 2), alpha=_KEY_WIDTH**-0.5)
         mixed = energy.softmax(dim=2) @ self.value(x)
-        return x + torch.relu(self.norm(self.out(mixed), there))
+        return x + torch.relu(self.norm(self.out(x - mixed), there))
 
 
 class Vpt(nn.Module):

@@ -65,12 +65,10 @@ class Examples:
 
     def view(self, number: int, *, occlusion: bool) -> SeenLandmarks:
         """Return what a view sees; with ``occlusion`` without the landmarks behind the surface."""
-        rows = slice(int(self.starts[number]), int(self.starts[number + 1]))
-        part = [getattr(self.seen, f.name)[rows] for f in dataclasses.fields(self.seen)]
+        rows = np.arange(self.starts[number], self.starts[number + 1])
         if occlusion:
-            free = ~self.occluded[rows]
-            part = [values[free] for values in part]
-        return SeenLandmarks(*part)
+            rows = rows[~self.occluded[rows]]
+        return dataclasses.replace(self.seen.rows(rows), visible=len(rows))
 
 
 def find_scenes(datasets: Sequence[Path]) -> tuple[SceneFolder, ...]:
@@ -187,8 +185,14 @@ def _same(camera: Camera, shard: Shard, scene: SceneFolder) -> Camera:
 
 
 def _joined(parts: Sequence[SeenLandmarks]) -> SeenLandmarks:
-    fields = [f.name for f in dataclasses.fields(SeenLandmarks)]
-    return SeenLandmarks(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
+    return SeenLandmarks(
+        landmark=np.concatenate([p.landmark for p in parts]),
+        uv_px=np.concatenate([p.uv_px for p in parts]),
+        distance_m=np.concatenate([p.distance_m for p in parts]),
+        angle_rad=np.concatenate([p.angle_rad for p in parts]),
+        off_mean_rad=np.concatenate([p.off_mean_rad for p in parts]),
+        visible=sum(p.visible for p in parts),
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -86,7 +86,7 @@ def fit(
             if progress is not None:
                 progress(_told(rules, history, best), len(history), rules.epochs)
         assert kept is not None
-        network.load_state_dict({name: torch.from_numpy(value) for name, value in kept.items()})
+        network.load_state_dict({name: _tensor(value) for name, value in kept.items()})
         return Fitted(kept, best, history, _log_odds(network, material.validation))
 
 
@@ -144,8 +144,8 @@ def _train(
     for number, views in enumerate(batches):
         _set_rate(optimizer, rules, (epoch * len(batches) + number) / (_epochs(rules) * len(batches)))
         arrays = inputs.varied(views, occluded[views], rng)
-        label = torch.from_numpy(inputs.label[views]).to(device)
-        logits = network(*(torch.from_numpy(a).to(device) for a in arrays))
+        label = _tensor(inputs.label[views]).to(device)
+        logits = network(*(_tensor(a).to(device) for a in arrays))
         weight = torch.where(label, 0.5 / share, 0.5 / (1.0 - share))
         loss = torch.nn.functional.binary_cross_entropy_with_logits(
             logits[:, 1] - logits[:, 0], label.to(logits.dtype), weight=weight.to(logits.dtype)
@@ -187,7 +187,7 @@ def _log_odds(network: torch.nn.Module, inputs: Inputs) -> Array:
             for start in range(0, len(inputs.label), _SCORED_AT_ONCE):
                 views = np.arange(start, min(start + _SCORED_AT_ONCE, len(inputs.label)))
                 arrays = inputs.plain(views, occlusion=occlusion)
-                logits = network(*(torch.from_numpy(a).to(device) for a in arrays)).double()
+                logits = network(*(_tensor(a).to(device) for a in arrays)).double()
                 result[row, views] = (logits[:, 1] - logits[:, 0]).cpu().numpy()
     return result
 
@@ -197,6 +197,13 @@ def _judged(odds: Array, material: Material) -> tuple[float, float]:
     half = max(int(np.bincount(material.waypoint).max()) // 2, 1)
     loss = float(np.mean([log_loss(row, label) for row in odds]))
     return loss, float(np.mean([chosen_share(row, label, material.waypoint, of=half) for row in odds]))
+
+
+def _tensor(values: NDArray[Any]) -> torch.Tensor:
+    """Return an array as a tensor in memory of torch's own: of other alignment the same sums have other last bits."""
+    import torch
+
+    return torch.from_numpy(values).clone()
 
 
 def _arrays(tensors: dict[str, torch.Tensor]) -> dict[str, NDArray[Any]]:
@@ -214,11 +221,10 @@ def _moments(optimizer: torch.optim.Optimizer) -> dict[str, NDArray[Any]]:
 
 
 def _restore(network: torch.nn.Module, optimizer: torch.optim.Optimizer, state: State) -> None:
-    import torch
 
-    network.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in state.network.items()})
+    network.load_state_dict({name: _tensor(value) for name, value in state.network.items()})
     moments: dict[int, dict[str, torch.Tensor]] = {}
     for key, value in state.optimizer.items():
         number, _, name = key.partition(".")
-        moments.setdefault(int(number), {})[name] = torch.from_numpy(value.copy())
+        moments.setdefault(int(number), {})[name] = _tensor(value)
     optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})

@@ -18,6 +18,8 @@ Arrays = tuple[NDArray[np.generic], ...]
 # In training, by how much (1 sigma) a landmark's distances are off, relatively, and its angles and image position, as
 # shares of pi and of the image: where mapping saw it otherwise names the landmark, and with it the scene's views.
 _DISTANCE_JITTER, _PLACE_JITTER = 0.1, 0.02
+# In training, the share of the cells of the landmarks' heat maps that are emptied, for the same reason.
+_HEAT_DROPOUT = 0.3
 _DISTANCES, _PLACES = slice(0, 3), slice(3, 9)
 
 
@@ -77,42 +79,46 @@ class TokenInputs:
         return TOKEN_WIDTH + (self._appearance[0].shape[1] if self._appearance else 0)
 
     def plain(self, views: NDArray[np.int64], *, occlusion: bool) -> Arrays:
-        """Return tokens f32[b, n, width] and bool[b, n], which of them are landmarks."""
-        return padded([self._tokens(v, occlusion=occlusion, seed=0) for v in views], width=self.width)
+        """Return tokens f32[b, n, width] and the weight f32[b, n] of each."""
+        found = [self._tokens(v, occlusion=occlusion, seed=0) for v in views]
+        return padded([t for t, _ in found], visible=[n for _, n in found], width=self.width)
 
     def varied(self, views: NDArray[np.int64], occlusion: NDArray[np.bool_], rng: np.random.Generator) -> Arrays:
-        """Return tokens f32[b, n, width] and bool[b, n]: with jitter, and every second batch seen in a mirror."""
-        seed = int(rng.integers(2**31))
+        """Return tokens f32[b, n, width] and their weights: landmarks with jitter, every second batch in a mirror."""
+        seed, in_mirror = int(rng.integers(2**31)), rng.random() < 0.5
         found = [self._tokens(v, occlusion=bool(o), seed=seed) for v, o in zip(views, occlusion, strict=True)]
-        tokens, there = padded(found, width=self.width)
-        size = (*tokens.shape[:2], TOKEN_WIDTH)
-        noise = rng.standard_normal((*size[:2], _PLACES.stop), dtype=np.float32) * np.float32(self._rules.jitter)
-        tokens[..., _DISTANCES] *= np.exp(_DISTANCE_JITTER * noise[..., _DISTANCES])
-        tokens[..., _PLACES] += _PLACE_JITTER * noise[..., _PLACES]
-        if rng.random() < 0.5:
+        counts = [len(t) for t, _ in found]
+        tokens = np.concatenate([t for t, _ in found])
+        noise = rng.standard_normal((len(tokens), _PLACES.stop), dtype=np.float32) * np.float32(self._rules.jitter)
+        tokens[:, _DISTANCES] *= np.exp(_DISTANCE_JITTER * noise[:, _DISTANCES])
+        tokens[:, _PLACES] += _PLACE_JITTER * noise[:, _PLACES]
+        heat = tokens[:, _PLACES.stop : TOKEN_WIDTH]
+        heat *= rng.random(heat.shape, dtype=np.float32) >= _HEAT_DROPOUT * self._rules.jitter
+        if in_mirror:
             _mirror(tokens)
         np.clip(tokens, 0.0, 1.0, out=tokens)
-        tokens[~there] = 0.0
-        return tokens, there
+        return padded(np.split(tokens, np.cumsum(counts)[:-1]), visible=[n for _, n in found], width=self.width)
 
-    def _tokens(self, view: np.int64, *, occlusion: bool, seed: int) -> Floats:
+    def _tokens(self, view: np.int64, *, occlusion: bool, seed: int) -> tuple[Floats, int]:
+        """Return the tokens of a view, and how many landmarks it sees."""
         number = int(self._scene[view])
         scene = self._scenes[number]
         assert self._rules.cap is not None
         seen = scene.view(int(view - self._first[number]), occlusion=occlusion)
-        return landmark_tokens(
-            thinned(seen, cap=self._rules.cap, seed=seed),
+        kept = thinned(seen, cap=self._rules.cap, seed=seed)
+        tokens = landmark_tokens(
+            kept,
             scene.statistics,
             heat_maps=scene.heat_maps,
             camera=scene.camera,
             appearance=self._appearance[number] if self._appearance else None,
         )
+        return tokens, kept.visible
 
 
 def _mirror(tokens: Floats) -> None:
-    """Mirror views left to right in place: where their landmarks are seen, and where mapping saw them."""
+    """Mirror landmarks left to right in place: where they are seen, and where mapping saw them."""
     u = _PLACES.stop - 2
-    tokens[..., u] = 1.0 - tokens[..., u]
-    heat = tokens[..., _PLACES.stop : TOKEN_WIDTH]
-    cells = heat.reshape(*heat.shape[:2], HEAT_CELLS, HEAT_CELLS)[..., ::-1]
-    tokens[..., _PLACES.stop : TOKEN_WIDTH] = cells.reshape(heat.shape)
+    tokens[:, u] = 1.0 - tokens[:, u]
+    heat = tokens[:, _PLACES.stop : TOKEN_WIDTH].reshape(-1, HEAT_CELLS, HEAT_CELLS)
+    tokens[:, _PLACES.stop : TOKEN_WIDTH] = heat[:, :, ::-1].reshape(-1, HEAT_CELLS**2)
