@@ -38,7 +38,7 @@ def train(
         datasets: dataset folders, finished and made with the same settings
         out: .safetensors file to write
         model: mlp, vpt, or with the appearance of landmarks vpt_appearance (EfficientNet) or vpt_dino (DINOv2)
-        validate: scene by which epoch and temperature are chosen; by default the last one in alphabetical order
+        validate: scene by which epoch and temperature are chosen; by default the one of median difficulty
         test: dataset of test scenes: none of them may be trained or validated on; may be repeated
         seed: seed of weights, order and variations
         epochs: how often the training views are gone over at most

@@ -163,7 +163,7 @@ def test_the_best_of_some_drawn_views_is_the_mean_over_all_draws(rng: np.random.
 
 
 def test_a_scene_is_trained_on_or_validated_on_but_never_both(views: Path, tmp_path: Path) -> None:
-    split = split_scenes(find_scenes([views]))
+    split = split_scenes(find_scenes([views]), validate="c")
     assert ([s.name for s in split.training], split.validation.name) == (["a", "b"], "c")
     for validate, test, said in [
         ("d", (), r"no scene 'd' to validate on; .*known: a, b, c"),
@@ -188,7 +188,7 @@ def test_data_that_cannot_be_trained_on_is_named_in_one_line(own: Path, tmp_path
     out = tmp_path / "x.safetensors"
     relabel(own, "c", label=False)
     with pytest.raises(TrainingError, match=r"set: in the validation scene c every view fails; expected .*both"):
-        train([own], out, rules=QUICK)
+        train([own], out, rules=QUICK, validate="c")
     aliked = write_views(tmp_path / "aliked", ("d",), seed=5)
     text = (aliked / "dataset.toml").read_text().replace('feature = "sift"', 'feature = "aliked"')
     (aliked / "dataset.toml").write_text(text)
@@ -196,7 +196,7 @@ def test_data_that_cannot_be_trained_on_is_named_in_one_line(own: Path, tmp_path
         train([own, aliked], out, rules=QUICK)
     shard_path(own, "b", read_scene(own, "b").waypoints[2]).unlink()
     with pytest.raises(DatasetError, match=r"set: 1 of 6 waypoints of 'b' are missing, w2 first; .*finish the dataset"):
-        train([own], out, rules=QUICK)
+        train([own], out, rules=QUICK, validate="c")
     with pytest.raises(TrainingError, match=r"1 scene to train and validate on \(e\); expected at least two"):
         train([write_views(tmp_path / "one", ("e",))], out, rules=QUICK)
     assert not out.exists()

@@ -137,7 +137,7 @@ def read_examples(scene: SceneFolder, *, progress: Progress | None = None) -> Ex
     camera: Camera | None = None
     for number, waypoint in enumerate(scene.entry.waypoints):
         shard = read_scene_shard(scene.folder, scene.entry, waypoint)
-        views = np.array([i for i, k in enumerate(shard.kinds) if k in scene.rules.candidates.kinds], dtype=np.int64)
+        views = _candidates(shard, scene)
         labels.append(shard.label[views])
         waypoints.append(np.full(len(views), number, dtype=np.int32))
         parts += [_seen(shard, int(i), scene_map, statistics) for i in views]
@@ -206,7 +206,8 @@ class Split:
 def split_scenes(scenes: Sequence[SceneFolder], *, validate: str | None = None, tests: Sequence[Path] = ()) -> Split:
     """Split scenes into those to train on and one to validate on: never by view, and never a view in both.
 
-    Without a name the last scene in alphabetical order is the one to validate on. Raises TrainingError when there is
+    Without a name the scene of median difficulty is the one to validate on: by the share of its views that localize,
+    then by name. Raises TrainingError when there is
     no such scene or no other, when two scenes are the same place, or one is in a dataset that is kept for ``tests``.
     """
     names = [s.name for s in scenes]
@@ -215,13 +216,26 @@ def split_scenes(scenes: Sequence[SceneFolder], *, validate: str | None = None, 
             f"{len(names)} scene to train and validate on ({', '.join(names)}); expected at least two",
             hint="give a dataset of more scenes, or more datasets",
         )
-    chosen = max(names) if validate is None else validate
-    if chosen not in names:
-        raise TrainingError(f"no scene {chosen!r} to validate on", hint=suggestion(chosen, names))
+    if validate is not None and validate not in names:
+        raise TrainingError(f"no scene {validate!r} to validate on", hint=suggestion(validate, names))
     for number, scene in enumerate(scenes):
         _refuse_same_place(scene, scenes[:number])
         _refuse_tested(scene, tests)
+    by_difficulty = sorted((_localized(s), s.name) for s in scenes) if validate is None else []
+    chosen = by_difficulty[len(by_difficulty) // 2][1] if validate is None else validate
     return Split(tuple(s for s in scenes if s.name != chosen), next(s for s in scenes if s.name == chosen))
+
+
+def _localized(scene: SceneFolder) -> float:
+    """Return the share of a scene's candidate views that localize."""
+    shards = [read_scene_shard(scene.folder, scene.entry, w) for w in scene.entry.waypoints]
+    return float(np.mean(np.concatenate([s.label[_candidates(s, scene)] for s in shards])))
+
+
+def _candidates(shard: Shard, scene: SceneFolder) -> NDArray[np.int64]:
+    """Return the indices of the views among which policies choose."""
+    allowed = scene.rules.candidates.kinds
+    return np.array([i for i, kind in enumerate(shard.kinds) if kind in allowed], dtype=np.int64)
 
 
 def _refuse_same_place(scene: SceneFolder, others: Sequence[SceneFolder]) -> None:

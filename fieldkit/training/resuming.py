@@ -62,7 +62,7 @@ def write_state(out: Path, state: State, *, key: str) -> None:
     head = _Head(1, key, state.best, state.history)
     parts = {"network": state.network, "optimizer": state.optimizer, "kept": state.kept}
     tensors = {
-        f"{part}/{name}": np.ascontiguousarray(v) for part, values in parts.items() for name, v in values.items()
+        f"{part}/{name}": np.asarray(v, order="C") for part, values in parts.items() for name, v in values.items()
     }
     atomic_write(state_path(out), save(tensors, metadata={_KEY: json.dumps(plain(head))}))
 
