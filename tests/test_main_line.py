@@ -19,6 +19,7 @@ from fieldkit.bags import BagFormat, open_recording
 from fieldkit.frames import Pose, yaw_pose
 from fieldkit.localize import Localizer
 from fieldkit.maps import content_digest
+from fieldkit.policies import LEARNED
 from fieldkit.replay import replay
 from fieldkit.report import write_report
 from fieldkit.store.inputs import SessionFile, SessionView, SessionVisit
@@ -69,7 +70,17 @@ def test_every_row_of_the_paper_s_table_is_there(run: Run) -> None:
     found = [(s.policy, s.occlusion) for s in scores.summarize_run(run)]
     counting = [(name, use) for name in ("max", "angle", "fim") for use in (False, True)]
     passive = [(name, None) for name in ("stowed", "forward", "odometry", "random")]
-    assert found == [*passive, *counting, ("best_possible", None)]
+    trained = [name for name in LEARNED if name not in {e.what for e in run.excluded}]
+    learned = [(name, use) for name in PAPER.policies if name in trained for use in (False, True)]
+    assert found == [*passive, *counting, *learned, ("best_possible", None)]
+
+
+def test_a_learned_row_is_there_or_named_as_excluded(run: Run) -> None:
+    scored = {s.policy for s in scores.summarize_run(run)}
+    excluded = {e.what for e in run.excluded}
+    assert set(LEARNED) == (scored | excluded) & set(LEARNED)
+    assert not scored & excluded
+    assert set(run.weights) == scored & set(LEARNED)
 
 
 def test_weights_of_a_policy_sum_to_one_at_every_visit(run: Run) -> None:

@@ -267,14 +267,14 @@ def test_an_unknown_policy_is_refused_with_a_suggestion() -> None:
 
 
 def test_a_policy_without_weights_says_so() -> None:
-    with pytest.raises(PolicyError, match="policy 'vpt' has no weights in this version; use one of stowed"):
-        policies.available("vpt")
+    with pytest.raises(PolicyError, match="policy 'vpt_dino' has no weights in this version; train it"):
+        policies.available("vpt_dino")
 
 
 def test_no_policy_is_given_images_estimates_or_truth() -> None:
     names = {f.name for f in dataclasses.fields(policies.Scene)} | {f.name for f in dataclasses.fields(Candidates)}
     assert names == {
-        "candidates", "visible", "statistics",
+        "candidates", "visible", "statistics", "heat_maps",
         "visit", "view_ids", "kinds", "map_from_cam", "camera", "allowed", "forward_in_map",
     }  # fmt: skip
 

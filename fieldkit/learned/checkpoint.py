@@ -129,6 +129,11 @@ def _about(header: str, path: Path) -> About:
         raise WeightsError(error.message, hint=error.hint) from error
     except json.JSONDecodeError as error:
         raise WeightsError(f"{path}: its header is damaged; expected {WHAT}", hint="copy the file again") from error
+    if not np.isfinite([about.bias, about.temperature]).all():
+        raise WeightsError(
+            f"{path}: has the bias {about.bias:g} and the temperature {about.temperature:g}; expected finite numbers",
+            hint="train again",
+        )
     now = normalisation()
     other = next((k for k in sorted({*now, *about.normalisation}) if now.get(k) != about.normalisation.get(k)), None)
     if other is not None:

@@ -34,10 +34,18 @@ def shipped_weights() -> Path:
 
 def shipped(name: str) -> Checkpoint:
     """Read the shipped weights of a learned policy; raises PolicyError when there are none."""
-    path = shipped_weights() / f"{name}{SUFFIX}"
-    if not path.is_file():
+    refuse_unshipped(name)
+    return _checkpoint(shipped_weights() / f"{name}{SUFFIX}", name)
+
+
+def refuse_unshipped(name: str) -> None:
+    """Raise PolicyError when a learned policy has no shipped weights."""
+    if not _is_shipped(name):
         raise PolicyError(f"policy {name!r} has no weights in this version", hint=_GIVE)
-    return _checkpoint(path, name)
+
+
+def _is_shipped(name: str) -> bool:
+    return (shipped_weights() / f"{name}{SUFFIX}").is_file()
 
 
 def find_checkpoints(
@@ -61,7 +69,7 @@ def find_checkpoints(
     for name in wanted:
         if name in own:
             found[name] = own[name]
-        elif (shipped_weights() / f"{name}{SUFFIX}").is_file():
+        elif _is_shipped(name):
             found[name] = shipped(name)
         else:
             missing.append(Excluded(name, f"has no weights in this version; {_GIVE}"))

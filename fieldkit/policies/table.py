@@ -39,7 +39,9 @@ NOT_RANKED = ("odometry", "best_possible")
 
 
 def available(name: str) -> Policy:
-    """Return a policy by name; raises PolicyError when it is unknown."""
+    """Return a policy by name; raises PolicyError when it is unknown, or learned and without shipped weights."""
+    if name in learned.LEARNED:
+        learned.refuse_unshipped(name)
     if name in POLICIES:
         return POLICIES[name]
     known = [*POLICIES, *NOT_RANKED]

@@ -17,6 +17,7 @@ from fieldkit import protocol as protocols
 from fieldkit.protocol import Threshold
 from fieldkit.report import figures
 from fieldkit.report.palette import Style, style
+from fieldkit.report.reasons import reasons_svg, strongest
 from fieldkit.report.tags import TagSection, tag_section
 from fieldkit.report.visits import VisitRows, visit_rows
 from fieldkit.scores import (
@@ -93,6 +94,8 @@ class Waypoint:
     facts: tuple[tuple[str, str], ...]
     choices: tuple[Choice, ...]
     views: tuple[Choice, ...]
+    why: Markup | None
+    why_words: tuple[tuple[str, str], ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,6 +205,7 @@ def _provenance(run: Run) -> tuple[tuple[str, str], ...]:
         ("Tags digest", run.tags_digest or "none"),
         ("Corrections", "; ".join(f"{c.kind}: {c.path} ({c.digest})" for c in run.corrections) or "none"),
         ("Seconds of building the map", _seconds_words(run)),
+        ("Weights of policies", ", ".join(f"{name} {digest}" for name, digest in run.weights.items()) or "none"),
         ("Seed", str(run.seed)),
         ("Versions", ", ".join(f"{name} {version}" for name, version in sorted(run.versions.items())) or "none"),
     )  # fmt: skip
@@ -288,7 +292,16 @@ def _waypoint(run: Run, visit: VisitRows, anchor: str) -> Waypoint:
         ("Candidates", f"{int(plan.candidates.allowed.sum())} of {_count(len(visit.results), 'recorded view')}"),
     )
     title = f"{plan.session} · {prior.visit}" if len(run.sessions) > 1 else prior.visit
-    return Waypoint(anchor, title, facts, _choices(run, visit), _all_views(run, visit))
+    why = reasons_svg(plan, run.plan_view, order=run.protocol.policies, name=f"{anchor}y")
+    return Waypoint(
+        anchor=anchor,
+        title=title,
+        facts=facts,
+        choices=_choices(run, visit),
+        views=_all_views(run, visit),
+        why=None if why is None else Markup(why),
+        why_words=strongest(plan.reasons),
+    )
 
 
 def _truth_of(truths: Sequence[Truth]) -> str:
