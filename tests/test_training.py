@@ -13,7 +13,9 @@ from tiny_views import relabel, write_views
 from fieldkit.errors import DatasetError, FieldkitError, TrainingError
 from fieldkit.learned.checkpoint import read_checkpoint
 from fieldkit.learned.scoring import Scorer
-from fieldkit.store.datasets import read_dataset, read_scene, shard_path, write_dataset
+from fieldkit.maps import load_map
+from fieldkit.maps.appearance import write_appearance
+from fieldkit.store.datasets import map_path, read_dataset, read_scene, shard_path, write_dataset
 from fieldkit.training import (
     TrainingRules,
     chosen_share,
@@ -25,7 +27,8 @@ from fieldkit.training import (
     train,
 )
 from fieldkit.training.inputs import HistogramInputs, TokenInputs
-from fieldkit.training.resuming import state_path
+from fieldkit.training.reducing import fit_reduction
+from fieldkit.training.resuming import Epoch, State, read_state, state_path, write_state
 from fieldkit.views import landmark_tokens, view_histograms
 
 QUICK = TrainingRules("vpt", epochs=3, cap=16, batch=24)
@@ -96,6 +99,51 @@ def test_a_checkpoint_says_what_it_was_trained_on(views: Path, tmp_path: Path) -
     card = report.card.read_text()
     assert "| a | validation | 72 |" in card
     assert "Brier score" in card
+
+
+def with_appearance(folder: Path, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Give every landmark of a dataset an appearance that differs in three directions more than in others."""
+    result = {}
+    for scene in find_scenes([folder]):
+        scene_map = load_map(map_path(folder, scene.entry))
+        vectors = 0.1 * rng.normal(size=(len(scene_map.xyz), 112))
+        vectors[:, :3] += (3.0, 2.0, 1.0) * rng.normal(size=(len(vectors), 3))
+        result[scene.name] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        halves = result[scene.name].astype(np.float16)
+        write_appearance(Path(scene_map.path), "efficientnet", halves, digest=scene_map.digest)
+    return result
+
+
+def test_appearance_is_reduced_as_the_training_scenes_tell(own: Path, tmp_path: Path, rng: np.random.Generator) -> None:
+    rules = dataclasses.replace(QUICK, model="vpt_appearance")
+    with pytest.raises(TrainingError, match=r"a\.map: has no appearance of its landmarks by efficientnet, which"):
+        train([own], tmp_path / "x.safetensors", rules=rules, validate="c")
+    vectors = with_appearance(own, rng)
+    report = train([own], tmp_path / "x.safetensors", rules=rules, validate="c")
+    found = read_checkpoint(report.path)
+    assert (found.about.kind, found.about.appearance) == ("vpt_appearance", "efficientnet")
+    assert found.reduction is not None
+    expected = fit_reduction([vectors["a"].astype(np.float16), vectors["b"].astype(np.float16)])
+    np.testing.assert_array_equal(found.reduction.components, expected.components)
+    np.testing.assert_allclose(np.abs(found.reduction.components[:, :3]), np.eye(3), atol=0.2)
+    reduced = found.reduction(vectors["a"])
+    assert reduced.min() == 0.0
+    assert reduced.max() == 1.0
+    assert 0.0 < np.mean(reduced == 0.0) < 0.04
+    assert Scorer(found).scores([np.zeros((0, 76), dtype=np.float32)]).shape == (1,)
+
+
+def test_a_state_comes_back_as_it_was(tmp_path: Path) -> None:
+    tensors = {"weight": np.arange(6.0, dtype=np.float32).reshape(2, 3), "count": np.array(7)}
+    state = State(tensors, tensors, tensors, 0, (Epoch(0.5, 0.6, 0.7),))
+    write_state(tmp_path / "x", state, key="k")
+    found = read_state(tmp_path / "x", key="k")
+    assert found is not None
+    assert (found.best, found.history) == (state.best, state.history)
+    for part in (found.network, found.optimizer, found.kept):
+        assert {n: (v.shape, v.tobytes()) for n, v in part.items()} == {
+            n: (v.shape, v.tobytes()) for n, v in tensors.items()
+        }
 
 
 def test_examples_are_the_features_of_the_shards(views: Path) -> None:
