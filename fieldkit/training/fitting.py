@@ -131,18 +131,21 @@ def _train(
     """Go once over all views in random order; return the mean loss. All chance comes from seed and epoch."""
     import torch
 
+    assert rules.epochs is not None
+    assert rules.batch is not None
+    epochs, batch = rules.epochs, rules.batch
     rng = np.random.default_rng([rules.seed, epoch])
     torch.manual_seed(int(rng.integers(2**31)))
     device = next(network.parameters()).device
     order = rng.permutation(len(inputs.label))
     occluded = rng.random(len(order)) < rules.occluded
     # Batch normalisation knows nothing of a single view: what is left over waits for another epoch.
-    batches = [b for b in np.array_split(order, max(len(order) // rules.batch, 1)) if len(b) > 1]
+    batches = [b for b in np.array_split(order, max(len(order) // batch, 1)) if len(b) > 1]
     share = float(np.mean(inputs.label))
     network.train()
     total = 0.0
     for number, views in enumerate(batches):
-        _set_rate(optimizer, rules, (epoch * len(batches) + number) / (_epochs(rules) * len(batches)))
+        _set_rate(optimizer, rules, (epoch * len(batches) + number) / (epochs * len(batches)))
         arrays = inputs.varied(views, occluded[views], rng)
         label = _tensor(inputs.label[views]).to(device)
         logits = network(*(_tensor(a).to(device) for a in arrays))
@@ -157,11 +160,6 @@ def _train(
         if progress is not None:
             progress(f"epoch {epoch + 1} | loss {total / (number + 1):.3f}", number + 1, len(batches))
     return total / len(batches)
-
-
-def _epochs(rules: TrainingRules) -> int:
-    assert rules.epochs is not None
-    return rules.epochs
 
 
 def _set_rate(optimizer: torch.optim.Optimizer, rules: TrainingRules, done: float) -> None:

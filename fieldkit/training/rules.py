@@ -29,7 +29,7 @@ class TrainingRules:
     seed: int = 0
     epochs: int | None = None
     patience: int = 8
-    batch: int = 64
+    batch: int | None = None
     learning_rate: float = 1e-3
     weight_decay: float = 0.01
     cap: int | None = None
@@ -52,7 +52,14 @@ class TrainingRules:
 
     def settled(self) -> TrainingRules:
         """Return the rules with what was left open filled in."""
-        mlp = self.model == "mlp"
-        epochs = self.epochs if self.epochs is not None else (15 if mlp else 12)
-        cap = None if mlp else (self.cap if self.cap is not None else 256)
-        return dataclasses.replace(self, epochs=epochs, cap=cap)
+        whole = self.model == "mlp"
+        return dataclasses.replace(
+            self,
+            epochs=_given(self.epochs, 12 if whole else 8),
+            batch=_given(self.batch, 400 if whole else 64),
+            cap=None if whole else _given(self.cap, 128),
+        )
+
+
+def _given(value: int | None, default: int) -> int:
+    return default if value is None else value
