@@ -84,7 +84,7 @@ def test_a_trained_network_chooses_views_that_localize_in_a_scene_it_never_saw(v
     assert filtered.reliability.brier < 0.8 * filtered.reliability.brier_of_rate
     scorer = Scorer(read_checkpoint(report.path))
     scene = read_examples(next(s for s in find_scenes([views]) if s.name == "b"))
-    histograms = HistogramInputs([scene]).plain(np.arange(len(scene.label)), occlusion=True)[0]
+    histograms = HistogramInputs([scene], QUICK).plain(np.arange(len(scene.label)), occlusion=True)[0]
     scores = scorer.scores(list(np.asarray(histograms, dtype=np.float32)))
     assert chosen_share(scores, scene.label, scene.waypoint) == pytest.approx(filtered.chosen)
     assert np.mean((scores - scene.label) ** 2) == pytest.approx(filtered.reliability.brier, abs=1e-5)
@@ -152,7 +152,7 @@ def test_examples_are_the_features_of_the_shards(views: Path) -> None:
     assert 0.0 < scene.label.mean() < 1.0
     for occlusion in (True, False):
         numbers = np.array([0, 71])
-        (histograms,) = HistogramInputs([scene]).plain(numbers, occlusion=occlusion)
+        (histograms,) = HistogramInputs([scene], QUICK).plain(numbers, occlusion=occlusion)
         whole = TokenInputs([scene], dataclasses.replace(QUICK, cap=4096))
         tokens, weight = whole.plain(numbers, occlusion=occlusion)
         for row, view in enumerate(numbers):
@@ -177,6 +177,17 @@ def test_views_in_a_mirror_are_those_of_a_mirrored_building(views: Path) -> None
     np.testing.assert_array_equal(other[..., 0], heat[..., 7])
     _mirror(mirrored)
     np.testing.assert_allclose(mirrored, tokens, atol=1e-6)
+
+
+def test_histograms_in_a_mirror_are_those_of_mirrored_pixels(views: Path) -> None:
+    from fieldkit.training.inputs import _mirrored
+
+    scene = read_examples(find_scenes([views])[0])
+    seen = scene.view(3, occlusion=False)
+    turned = dataclasses.replace(seen, uv_px=(scene.camera.width, 0.0) - seen.uv_px * (1.0, -1.0))
+    plain, mirrored = (view_histograms(s, scene.statistics, camera=scene.camera) for s in (seen, turned))
+    np.testing.assert_array_equal(_mirrored(plain[None])[0], mirrored)
+    assert (plain != mirrored).any()
 
 
 def test_a_temperature_and_a_bias_give_back_the_probabilities(rng: np.random.Generator) -> None:

@@ -12,12 +12,15 @@ from fieldkit.learned.batches import padded
 from fieldkit.training.examples import Examples, Progress
 from fieldkit.training.rules import TrainingRules
 from fieldkit.views import HEAT_CELLS, HISTOGRAM_WIDTH, TOKEN_WIDTH, landmark_tokens, thinned, view_histograms
+from fieldkit.views.features import BINS
 
 Floats = NDArray[np.float32]
 Arrays = tuple[NDArray[np.generic], ...]
 # In training, by how much (1 sigma) a landmark's distances are off, relatively, and its angles and image position, as
 # shares of pi and of the image: where mapping saw it otherwise names the landmark, and with it the scene's views.
 _DISTANCE_JITTER, _PLACE_JITTER = 0.1, 0.02
+# In training, noise (1 sigma) on the histograms, which are logarithms of counts: a count is off by a third.
+_COUNT_JITTER = 0.035
 # In training, the share of the cells of the landmarks' heat maps that are emptied, for the same reason.
 _HEAT_DROPOUT = 0.3
 _DISTANCES, _PLACES = slice(0, 3), slice(3, 9)
@@ -38,8 +41,9 @@ class Inputs(Protocol):
 class HistogramInputs:
     """Histograms f32[v, 146], computed once with and without the landmarks behind the surface."""
 
-    def __init__(self, scenes: Sequence[Examples], *, progress: Progress | None = None) -> None:
+    def __init__(self, scenes: Sequence[Examples], rules: TrainingRules, *, progress: Progress | None = None) -> None:
         self.label = np.concatenate([s.label for s in scenes])
+        self._jitter = rules.jitter
         self._histograms = {
             use: np.concatenate([_histograms(s, occlusion=use, progress=progress) for s in scenes])
             for use in (False, True)
@@ -50,8 +54,12 @@ class HistogramInputs:
         return (self._histograms[occlusion][views],)
 
     def varied(self, views: NDArray[np.int64], occlusion: NDArray[np.bool_], rng: np.random.Generator) -> Arrays:
-        """Return histograms f32[b, 146], each with or without the landmarks behind the surface."""
-        return (np.where(occlusion[:, None], self._histograms[True][views], self._histograms[False][views]),)
+        """Return histograms f32[b, 146]: with noise on every count, every second batch in a mirror."""
+        chosen = np.where(occlusion[:, None], self._histograms[True][views], self._histograms[False][views])
+        in_mirror = rng.random() < 0.5
+        noise = rng.standard_normal(chosen.shape, dtype=np.float32) * np.float32(_COUNT_JITTER * self._jitter)
+        chosen = np.where(chosen > 0.0, np.clip(chosen + noise, 0.0, 1.0), 0.0)
+        return (_mirrored(chosen) if in_mirror else chosen,)
 
 
 def _histograms(scene: Examples, *, occlusion: bool, progress: Progress | None) -> Floats:
@@ -61,6 +69,17 @@ def _histograms(scene: Examples, *, occlusion: bool, progress: Progress | None) 
         if progress is not None and (i + 1 == len(rows) or i % 100 == 99):
             progress(f"histograms of {scene.scene}{', occlusion filter' if occlusion else ''}", i + 1, len(rows))
     return rows
+
+
+def _mirrored(histograms: Floats) -> Floats:
+    """Return histograms of views mirrored left to right: the cells of the image and, behind them, the bins of u."""
+    result = histograms.copy()
+    u = slice(HISTOGRAM_WIDTH - 2 * BINS, HISTOGRAM_WIDTH - BINS)
+    cells = slice(u.start - HEAT_CELLS**2, u.start)
+    image = histograms[:, cells].reshape(-1, HEAT_CELLS, HEAT_CELLS)
+    result[:, cells] = image[:, :, ::-1].reshape(len(histograms), -1)
+    result[:, u] = histograms[:, u][:, ::-1]
+    return result
 
 
 class TokenInputs:

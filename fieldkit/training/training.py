@@ -165,7 +165,7 @@ def _inputs(
     scenes: Sequence[Examples], rules: TrainingRules, reduction: Reduction | None, progress: Progress | None
 ) -> Inputs:
     if rules.model == "mlp":
-        return HistogramInputs(scenes, progress=progress)
+        return HistogramInputs(scenes, rules, progress=progress)
     network = APPEARANCE_OF.get(rules.model, "")
     reduced = () if reduction is None else tuple(reduction(s.appearance[network]) for s in scenes)
     return TokenInputs(scenes, rules, appearance=reduced)
