@@ -27,6 +27,7 @@ def train(
     seed: int = 0,
     epochs: int | None = None,
     cap: int | None = None,
+    drawn: int | None = None,
     json: bool = False,
     force: bool = False,
 ) -> None:
@@ -42,7 +43,8 @@ def train(
         test: dataset of test scenes: none of them may be trained or validated on; may be repeated
         seed: seed of weights, order and variations
         epochs: how often the training views are gone over at most
-        cap: landmarks of a view that are looked at, at most
+        cap: landmarks of a view that are looked at, at most; by default 256
+        drawn: landmarks of a view that it learns from at a time, at most; by default 64
         json: print JSON
         force: replace existing files
     """
@@ -51,7 +53,7 @@ def train(
     from fieldkit.training import TrainingRules
     from fieldkit.training import train as train_policy
 
-    rules = TrainingRules(model=model, seed=seed, epochs=epochs, cap=cap)
+    rules = TrainingRules(model=model, seed=seed, epochs=epochs, cap=cap, drawn=drawn)
     try:
         with ProgressBars() as progress:
             report = train_policy(

@@ -31,7 +31,7 @@ from fieldkit.training.reducing import fit_reduction
 from fieldkit.training.resuming import Epoch, State, read_state, state_path, write_state
 from fieldkit.views import landmark_tokens, view_histograms
 
-QUICK = TrainingRules("vpt", epochs=3, cap=16, batch=24)
+QUICK = TrainingRules("vpt", epochs=3, cap=24, drawn=16, batch=24)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_a_checkpoint_says_what_it_was_trained_on(views: Path, tmp_path: Path) -
     report = train([views], tmp_path / "x.safetensors", rules=QUICK, validate="a")
     about = read_checkpoint(report.path).about
     assert (about.training_scenes, about.validation_scenes) == (("b", "c"), ("a",))
-    assert (about.kind, about.feature, about.landmark_cap, about.seed) == ("vpt", "sift", 16, 0)
+    assert (about.kind, about.feature, about.landmark_cap, about.seed) == ("vpt", "sift", 24, 0)
     assert about.temperature == report.calibration.temperature
     card = report.card.read_text()
     assert "| a | validation | 72 |" in card

@@ -87,8 +87,10 @@ class TokenInputs:
 
     def __init__(self, scenes: Sequence[Examples], rules: TrainingRules, *, appearance: Sequence[Floats] = ()) -> None:
         assert rules.cap is not None, "a model of landmarks has a cap"
+        assert rules.drawn is not None, "the rules are settled"
+        self._cap, self._drawn, self._jitter = rules.cap, rules.drawn, np.float32(rules.jitter)
         self.label = np.concatenate([s.label for s in scenes])
-        self._scenes, self._rules, self._appearance = scenes, rules, appearance
+        self._scenes, self._appearance = scenes, appearance
         self._scene = np.repeat(np.arange(len(scenes)), [len(s.label) for s in scenes])
         self._first = np.cumsum([0, *(len(s.label) for s in scenes)])
 
@@ -99,32 +101,34 @@ class TokenInputs:
 
     def plain(self, views: NDArray[np.int64], *, occlusion: bool) -> Arrays:
         """Return tokens f32[b, n, width] and the weight f32[b, n] of each."""
-        found = [self._tokens(v, occlusion=occlusion, seed=0) for v in views]
+        found = [self._tokens(v, occlusion=occlusion, cap=self._cap) for v in views]
         return padded([t for t, _ in found], visible=[n for _, n in found], width=self.width)
 
     def varied(self, views: NDArray[np.int64], occlusion: NDArray[np.bool_], rng: np.random.Generator) -> Arrays:
         """Return tokens f32[b, n, width] and their weights: landmarks with jitter, every second batch in a mirror."""
         seed, in_mirror = int(rng.integers(2**31)), rng.random() < 0.5
-        found = [self._tokens(v, occlusion=bool(o), seed=seed) for v, o in zip(views, occlusion, strict=True)]
+        found = [
+            self._tokens(v, occlusion=bool(o), cap=self._drawn, seed=seed)
+            for v, o in zip(views, occlusion, strict=True)
+        ]
         counts = [len(t) for t, _ in found]
         tokens = np.concatenate([t for t, _ in found])
-        noise = rng.standard_normal((len(tokens), _PLACES.stop), dtype=np.float32) * np.float32(self._rules.jitter)
+        noise = rng.standard_normal((len(tokens), _PLACES.stop), dtype=np.float32) * self._jitter
         tokens[:, _DISTANCES] *= np.exp(_DISTANCE_JITTER * noise[:, _DISTANCES])
         tokens[:, _PLACES] += _PLACE_JITTER * noise[:, _PLACES]
         heat = tokens[:, _PLACES.stop : TOKEN_WIDTH]
-        heat *= rng.random(heat.shape, dtype=np.float32) >= _HEAT_DROPOUT * self._rules.jitter
+        heat *= rng.random(heat.shape, dtype=np.float32) >= _HEAT_DROPOUT * self._jitter
         if in_mirror:
             _mirror(tokens)
         np.clip(tokens, 0.0, 1.0, out=tokens)
         return padded(np.split(tokens, np.cumsum(counts)[:-1]), visible=[n for _, n in found], width=self.width)
 
-    def _tokens(self, view: np.int64, *, occlusion: bool, seed: int) -> tuple[Floats, int]:
+    def _tokens(self, view: np.int64, *, occlusion: bool, cap: int, seed: int = 0) -> tuple[Floats, int]:
         """Return the tokens of a view, and how many landmarks it sees."""
         number = int(self._scene[view])
         scene = self._scenes[number]
-        assert self._rules.cap is not None
         seen = scene.view(int(view - self._first[number]), occlusion=occlusion)
-        kept = thinned(seen, cap=self._rules.cap, seed=seed)
+        kept = thinned(seen, cap=cap, seed=seed)
         tokens = landmark_tokens(
             kept,
             scene.statistics,

@@ -20,7 +20,8 @@ class TrainingRules:
     ``epochs`` passes over the training views at most, and ``patience`` of them without a better choice of views in
     the validation scene end it early. Every step takes ``batch`` views; the learning rate rises to ``learning_rate``
     and falls as a cosine. ``occluded`` is the share of the views that are shown without the landmarks behind the
-    surface, the others with all: one network serves both. ``cap``: landmarks of a view that are looked at, at most.
+    surface, the others with all: one network serves both. ``cap``: landmarks of a view that are looked at, at most;
+    ``drawn``: of how many it learns at most, others each time, which is cheaper and keeps it from learning by heart.
     ``jitter`` scales the noise that is put on landmarks, see `fieldkit.training.inputs`. Raises TrainingError where a
     value cannot be used.
     """
@@ -33,11 +34,18 @@ class TrainingRules:
     learning_rate: float = 1e-3
     weight_decay: float = 0.01
     cap: int | None = None
+    drawn: int | None = None
     occluded: float = 0.9
     jitter: float = 1.0
 
     def __post_init__(self) -> None:
-        counts = {"epochs": self.epochs, "patience": self.patience, "batch": self.batch, "cap": self.cap}
+        counts = {
+            "epochs": self.epochs,
+            "patience": self.patience,
+            "batch": self.batch,
+            "cap": self.cap,
+            "drawn": self.drawn,
+        }
         for name, value in counts.items():
             if value is not None and value < (2 if name == "batch" else 1):
                 raise TrainingError(f"{name} is {value}; expected a positive number", hint=f"choose another {name}")
@@ -57,7 +65,8 @@ class TrainingRules:
             self,
             epochs=_given(self.epochs, 12 if whole else 8),
             batch=_given(self.batch, 400 if whole else 64),
-            cap=None if whole else _given(self.cap, 128),
+            cap=None if whole else _given(self.cap, 256),
+            drawn=None if whole else min(_given(self.drawn, 64), _given(self.cap, 256)),
         )
 
 
