@@ -136,7 +136,6 @@ def test_a_map_whose_surface_was_lost(tmp_path: Path, capsys: pytest.CaptureFixt
     ("change", "message"),
     [
         (('"max"', '"mx"'), "unknown policy 'mx'; did you mean 'max'"),
-        (('"max"', '"vpt"'), "policy 'vpt' has no weights in this version"),
         (('feature = "sift"', 'feature = "shift"'), "'shift'"),
         (('feature = "sift"', 'features = "sift"'), "unknown key 'features' at $; did you mean 'feature'"),
         (("position_m = 0.25", "position_m = 0.0"), "at `$.thresholds[0].position_m`"),
