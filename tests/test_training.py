@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from tiny_views import relabel, write_views
 
+from fieldkit.cli import main
 from fieldkit.errors import DatasetError, FieldkitError, TrainingError
 from fieldkit.learned.checkpoint import read_checkpoint
 from fieldkit.learned.scoring import Scorer
@@ -310,3 +312,25 @@ def test_what_is_there_is_not_replaced_unless_asked_for(views: Path, tmp_path: P
 def test_settings_that_cannot_be_used_are_named(changes: dict[str, float], said: str) -> None:
     with pytest.raises(TrainingError, match=said):
         TrainingRules(**changes)  # type: ignore[arg-type]
+
+
+def test_the_command_trains_and_says_what_the_validation_scene_says(
+    views: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", str(views), "--model", "mlp", "--epochs", "2", "--out", str(tmp_path / "x.safetensors")]
+    with pytest.raises(SystemExit) as done:
+        main([*words, "--validate", "b", "--json"])
+    assert done.value.code == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["validation"] == "b"
+    assert [v["occlusion"] for v in said["verdicts"]] == [True, False]
+    for again, code, line in [
+        (words, 1, "x.safetensors: exists"),
+        ([*words, "--force", "--validate", "z"], 1, "no scene 'z' to validate on; known: a, b, c"),
+        ([*words, "--force", "--validate", "a"], 0, "validation: a"),
+    ]:
+        with pytest.raises(SystemExit) as done:
+            main(again)
+        assert done.value.code == code
+        told = capsys.readouterr()
+        assert line in (told.err if code else told.out)
