@@ -22,6 +22,7 @@ from fieldkit.localize_commands import localize
 from fieldkit.map_commands import map_appearance, map_build, map_compact, map_export, map_import, map_info
 from fieldkit.tag_commands import tags_export, tags_import, tags_sheet
 from fieldkit.tag_tables import print_second, print_tags, second_json, tags_json
+from fieldkit.train_commands import train
 
 # Heavy rooms are imported inside the commands: `fieldkit report` must not wait for SfM, cameras and bags to load.
 
@@ -275,6 +276,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "replay": replay,
     "score": score,
     "report": report,
+    "train": train,
     "judge": judge,
 }
 GROUPS: dict[str, dict[str, Callable[..., Any]]] = {

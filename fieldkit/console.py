@@ -26,7 +26,10 @@ def log_handler() -> logging.Handler:
 
 
 class ProgressBars:
-    """Progress bars on stderr, one per step; a step is called as (what, done, total)."""
+    """Progress bars on stderr, one per step; a step is called as (what, done, total).
+
+    What stands behind " | " in ``what`` may change from call to call.
+    """
 
     def __init__(self) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -44,9 +47,10 @@ class ProgressBars:
     def _update(self, what: str, done: int, total: int) -> None:
         # Shown from the first step on: a mistake that is found before it stays one line.
         self._progress.start()
-        if what not in self._steps:
-            self._steps[what] = self._progress.add_task(what, total=total)
-        self._progress.update(self._steps[what], completed=done, total=total)
+        step = what.split(" | ")[0]
+        if step not in self._steps:
+            self._steps[step] = self._progress.add_task(what, total=total)
+        self._progress.update(self._steps[step], completed=done, total=total, description=what)
 
 
 def cells(values: Sequence[object]) -> list[str]:

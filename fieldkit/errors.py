@@ -80,6 +80,10 @@ class DatasetError(FieldkitError):
     """A dataset that cannot be made, continued or replayed as asked."""
 
 
+class TrainingError(FieldkitError):
+    """Scenes, labels or settings from which no policy can be trained, or an unfinished training of other ones."""
+
+
 class JudgeError(FieldkitError):
     """A session folder without the truth that a judge needs."""
 

@@ -118,6 +118,7 @@ def dataset(
     repeat_share: float = 0.1,
     unit: Literal["m", "cm", "mm"] | None = None,
     up: Literal["z", "y"] | None = None,
+    appearance: Literal["efficientnet", "dinov2"] | None = None,
     force: bool = False,
 ) -> None:
     """Make a dataset: many views of scenes, localized in maps of them; features and labels are stored, no images.
@@ -138,6 +139,8 @@ def dataset(
         repeat_share: share of the views that are localized again
         unit: unit of the meshes; by default they have to look like metres
         up: axis of the meshes that points up; by default it has to look like z
+        appearance: network whose view of the landmarks is added to the maps, for training vpt_appearance or vpt_dino;
+            also to a dataset that is made already
         force: make the views of these scenes again where they were made otherwise; maps that still fit are kept, and
             scenes of OUT that are not named stay: settings other than theirs are refused
     """
@@ -147,7 +150,7 @@ def dataset(
 
     refuse_lenses(load_sensors(sensors), where=sensors)
     mesh = _mesh_options(scenes, unit=unit, up=up)
-    options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh, feature)
+    options = DatasetOptions(seed, waypoints, views, sensors, changes, repeats, repeat_share, mesh, feature, appearance)
     made = make_scenes(scenes, out, options=options, workers=workers, force=force, progress=_ProgressLines())
     for row in made:
         again = "" if not row.repeats else f", {row.repeats} repeats: {100 * row.flipped:.1f} % change the label"

