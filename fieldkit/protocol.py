@@ -17,7 +17,9 @@ POLICY_NAMES = (
     "stowed", "forward", "random", "odometry", "max", "angle", "fim", "mlp", "vpt", "vpt_dino", "vpt_appearance",
     "best_possible",
 )  # fmt: skip
-COUNTING = ("max", "angle", "fim", "mlp", "vpt", "vpt_dino", "vpt_appearance")
+HEURISTICS = ("max", "angle", "fim")
+LEARNED = ("mlp", "vpt", "vpt_dino", "vpt_appearance")
+COUNTING = HEURISTICS + LEARNED
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]

@@ -19,7 +19,7 @@ from fieldkit.bags import BagFormat, open_recording
 from fieldkit.frames import Pose, yaw_pose
 from fieldkit.localize import Localizer
 from fieldkit.maps import content_digest
-from fieldkit.policies import LEARNED
+from fieldkit.protocol import LEARNED
 from fieldkit.replay import replay
 from fieldkit.report import write_report
 from fieldkit.store.inputs import SessionFile, SessionView, SessionVisit

@@ -3,7 +3,7 @@
 ``python docs/examples/sim_table.py DATASET RUN --learned vpt --heuristic max``, where RUN was written by ``fieldkit
 replay DATASET``, and the two policies are those that were best on the validation scene. With ``--repeatable`` the
 candidates that succeeded are localized again, so that best possible is also told without its luck (minutes).
-``--curves FILE.svg`` draws the cumulative errors.
+``--curves FILE.svg`` draws the cumulative errors, ``--reliability FILE.svg`` what learned policies said and what came.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from fieldkit import scores
 from fieldkit.dataset import SourceWaypoint
@@ -22,13 +24,17 @@ from fieldkit.dataset.worker import views_key
 from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer, Query
 from fieldkit.maps import load_map
+from fieldkit.protocol import LEARNED
 from fieldkit.report.figures import curve_svg
 from fieldkit.store import read_run
 from fieldkit.store.datasets import DatasetRules, Shard, map_path, read_dataset, read_scene, read_scene_shard, row_pose
+from fieldkit.training import reliability
 from fieldkit.types import Run
 from sim_bridge.dataset import SceneOptions, SceneSource
 from sim_bridge.stage.lookouts import LookoutOptions
 
+Array = NDArray[np.float64]
+Labels = NDArray[np.bool_]
 MARGIN = 0.03
 JUDGED = (0.1, 1.0)
 
@@ -130,6 +136,57 @@ def _share(ours: float, theirs: float, best: float) -> float:
     return (ours - theirs) / (best - theirs) if best > theirs else math.nan
 
 
+def said_and_true(dataset: Path, run: Run) -> dict[scores.Variant, tuple[Array, Labels]]:
+    """Return by learned policy the probability it gave to every candidate, and whether that localized."""
+    head, labels = read_dataset(dataset), {}
+    for name in head.scenes:
+        entry = read_scene(dataset, name)
+        for waypoint in entry.waypoints:
+            shard = read_scene_shard(dataset, entry, waypoint)
+            labels[name, waypoint] = dict(zip(shard.view_ids, shard.label.tolist(), strict=True))
+    found: dict[scores.Variant, tuple[list[float], list[bool]]] = {}
+    for plan in run.plans:
+        own = labels[plan.session.split("/")[-1], plan.prior.visit]
+        for variant, utilities in plan.utilities.items():
+            if variant[0] not in LEARNED:
+                continue
+            said, true = found.setdefault(variant, ([], []))
+            for view, utility in zip(plan.candidates.view_ids, utilities, strict=True):
+                if math.isfinite(utility):
+                    said.append(float(utility))
+                    true.append(own[view])
+    return {variant: (np.array(said), np.array(true)) for variant, (said, true) in found.items()}
+
+
+def reliability_table(found: Mapping[scores.Variant, tuple[Array, Labels]]) -> str:
+    """Return how well the probabilities hold: Brier score, that of always saying the mean rate, calibration error."""
+    rows = []
+    for (policy, occlusion), (said, true) in found.items():
+        r = reliability(said, true)
+        off = np.abs(np.subtract(r.said, r.localized)) @ np.array(r.views) / max(sum(r.views), 1)
+        numbers = (f"{r.brier:.3f}", f"{r.brier_of_rate:.3f}", f"{r.log_loss:.3f}", f"{100 * off:.1f} %")
+        rows.append([policy, "yes" if occlusion else "no", str(len(said)), *numbers])
+    return markdown(["policy", "occlusion", "views", "Brier", "of the mean rate", "log loss", "off by, mean"], rows)
+
+
+def draw_reliability(found: Mapping[scores.Variant, tuple[Array, Labels]], path: Path) -> None:
+    """Draw what was said against what localized, in ten bins per learned policy; areas are numbers of views."""
+    figure = Figure(figsize=(5.0, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot([0, 1], [0, 1], color="#c3ccd4", linewidth=1.0, zorder=0)
+    for (policy, occlusion), (said, true) in found.items():
+        r = reliability(said, true)
+        there = np.array(r.views) > 0
+        x, y, n = np.array(r.said)[there], np.array(r.localized)[there], np.array(r.views)[there]
+        (line,) = axes.plot(
+            x, y, "-" if occlusion else "--", linewidth=1.4, label=policy + (", filter" if occlusion else "")
+        )
+        axes.scatter(x, y, s=120 * n / n.max() + 4, color=line.get_color())
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="said to localize", ylabel="localized", aspect="equal")
+    axes.legend(frameon=False)
+    figure.savefig(path)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset", type=Path)
@@ -138,6 +195,7 @@ def main() -> None:
     parser.add_argument("--heuristic", default="max")
     parser.add_argument("--repeatable", action="store_true")
     parser.add_argument("--curves", type=Path)
+    parser.add_argument("--reliability", type=Path)
     args = parser.parse_args()
     run = read_run(args.run)
     print(recall_table(run), end="\n\n")
@@ -145,6 +203,11 @@ def main() -> None:
         print(comparison_table(run, args.learned, args.heuristic), end="\n\n")
         honest = repeatable(args.dataset) if args.repeatable else None
         print(distance_table(run, args.learned, args.heuristic, honest))
+    found = said_and_true(args.dataset, run)
+    if found:
+        print("", reliability_table(found), sep="\n")
+    if found and args.reliability is not None:
+        draw_reliability(found, args.reliability)
     if args.curves is not None:
         args.curves.write_text(curve_svg(run, "position", name="curves"), encoding="utf-8")
 

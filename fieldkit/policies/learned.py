@@ -14,13 +14,13 @@ from fieldkit.errors import PolicyError, WeightsError
 from fieldkit.learned.checkpoint import About, Checkpoint, read_checkpoint
 from fieldkit.learned.scoring import Scorer
 from fieldkit.policies.scene import Scene
+from fieldkit.protocol import LEARNED
 from fieldkit.types import Excluded, SceneMap
 from fieldkit.views import SeenLandmarks, landmark_tokens, seen_landmarks, thinned, view_histograms
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-LEARNED = ("mlp", "vpt", "vpt_dino", "vpt_appearance")
 SUFFIX = ".safetensors"
 # As many landmarks of a view are left out one by one to see what its score rests on.
 _ASKED = 512

@@ -10,10 +10,10 @@ import numpy as np
 from fieldkit.errors import PolicyError
 from fieldkit.features import feature_name
 from fieldkit.learned.checkpoint import Checkpoint
-from fieldkit.policies.learned import LEARNED, open_learned, without_appearance
+from fieldkit.policies.learned import open_learned, without_appearance
 from fieldkit.policies.scene import Scene, look_at
 from fieldkit.policies.table import NOT_RANKED, POLICIES, Array, Policy, available, utility
-from fieldkit.protocol import Protocol
+from fieldkit.protocol import LEARNED, Protocol
 from fieldkit.surface import RayCaster
 from fieldkit.types import Candidates, Excluded, Reason, SceneMap
 from fieldkit.views import HeatMaps, landmark_statistics

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fieldkit.errors import PolicyError, suggestion
 from fieldkit.policies import counting, fisher, learned, passive
 from fieldkit.policies.scene import Scene
+from fieldkit.protocol import LEARNED
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ POLICIES: dict[str, Policy] = {
     "max": Policy(counting.most_visible, counts_landmarks=True),
     "angle": Policy(counting.viewing_angle, counts_landmarks=True),
     "fim": Policy(fisher.fisher_information, counts_landmarks=True),
-    **{name: Policy(functools.partial(learned.score_shipped, name), counts_landmarks=True) for name in learned.LEARNED},
+    **{name: Policy(functools.partial(learned.score_shipped, name), counts_landmarks=True) for name in LEARNED},
 }
 
 # Rows of the tables that rank nothing: the prior scored as a pose, and the oracle that scoring computes.
@@ -40,7 +41,7 @@ NOT_RANKED = ("odometry", "best_possible")
 
 def available(name: str) -> Policy:
     """Return a policy by name; raises PolicyError when it is unknown, or learned and without shipped weights."""
-    if name in learned.LEARNED:
+    if name in LEARNED:
         learned.refuse_unshipped(name)
     if name in POLICIES:
         return POLICIES[name]

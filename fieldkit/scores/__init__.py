@@ -10,7 +10,7 @@ both thresholds.
 """
 
 from fieldkit.scores.bounds import PRESETS, PoseName, error_of, excess, inside, preset, tightest
-from fieldkit.scores.comparing import HEURISTICS, LEARNED, Comparison, Variant, compare, holm, learned_pairs
+from fieldkit.scores.comparing import Comparison, Variant, compare, holm, learned_pairs
 from fieldkit.scores.summary import (
     Summary,
     cumulative,
@@ -28,8 +28,6 @@ from fieldkit.trust import BEST_POSSIBLE
 
 __all__ = [
     "BEST_POSSIBLE",
-    "HEURISTICS",
-    "LEARNED",
     "NO_CANDIDATE",
     "ODOMETRY",
     "PRESETS",

@@ -8,13 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from fieldkit.errors import ScoreError
-from fieldkit.protocol import Threshold
+from fieldkit.protocol import HEURISTICS, LEARNED, Threshold
 from fieldkit.scores.bounds import Array, PoseName
 from fieldkit.scores.summary import group, hits
 from fieldkit.types import Trial
 
 Variant = tuple[str, bool | None]
-LEARNED, HEURISTICS = ("mlp", "vpt", "vpt_dino", "vpt_appearance"), ("max", "angle", "fim")
 # Resamples at once: bounds the memory
 _CHUNK = 1000
 
