@@ -75,15 +75,15 @@ redkitchen: install
 TABLE := build/table-sim
 TEST_SCENES := library clinic school museum
 LEARNED ?= vpt
-HEURISTIC ?= max
+HEURISTICS ?= max angle
 table-sim: install
 	$(BIN)/sim-bridge dataset --scenes $(TEST_SCENES) --repeats 1 --appearance efficientnet --out $(TABLE)/sift
 	$(BIN)/sim-bridge dataset --scenes $(TEST_SCENES) --feature aliked --views 24 --appearance efficientnet --out $(TABLE)/aliked
 	$(BIN)/fieldkit replay $(TABLE)/sift --protocol paper_sim --out $(TABLE)/run-sift --force
 	$(BIN)/fieldkit replay $(TABLE)/aliked --protocol paper_sim_aliked --out $(TABLE)/run-aliked --force
-	$(BIN)/python docs/examples/sim_table.py $(TABLE)/sift $(TABLE)/run-sift --learned $(LEARNED) --heuristic $(HEURISTIC) \
-	    --repeatable --curves $(TABLE)/curves.svg
-	$(BIN)/python docs/examples/sim_table.py $(TABLE)/aliked $(TABLE)/run-aliked --learned $(LEARNED) --heuristic $(HEURISTIC)
+	$(BIN)/python docs/examples/sim_table.py $(TABLE)/sift $(TABLE)/run-sift --learned $(LEARNED) --heuristics $(HEURISTICS) \
+	    --repeatable --curves $(TABLE)/curves.svg --reliability $(TABLE)/reliability.svg
+	$(BIN)/python docs/examples/sim_table.py $(TABLE)/aliked $(TABLE)/run-aliked --learned $(LEARNED) --heuristics $(HEURISTICS)
 
 clean:
 	rm -rf build .venv

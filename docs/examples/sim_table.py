@@ -1,7 +1,7 @@
 """Print the simulation table of a run on a dataset as Markdown: recall, paired comparisons, distance to the best view.
 
-``python docs/examples/sim_table.py DATASET RUN --learned vpt --heuristic max``, where RUN was written by ``fieldkit
-replay DATASET``, and the two policies are those that were best on the validation scene. With ``--repeatable`` the
+``python docs/examples/sim_table.py DATASET RUN --learned vpt --heuristics max angle``, where RUN was written by
+``fieldkit replay DATASET``, and the policies (heuristics with and without the occlusion filter) are those that were best on the validation scene. With ``--repeatable`` the
 candidates that succeeded are localized again, so that best possible is also told without its luck (minutes).
 ``--curves FILE.svg`` draws the cumulative errors, ``--reliability FILE.svg`` what learned policies said and what came.
 """
@@ -35,6 +35,7 @@ from sim_bridge.stage.lookouts import LookoutOptions
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.bool_]
+Pair = tuple[scores.Variant, scores.Variant]
 MARGIN = 0.03
 JUDGED = (0.1, 1.0)
 
@@ -87,9 +88,8 @@ def recall_table(run: Run) -> str:
     return "\n".join(lines)
 
 
-def comparison_table(run: Run, learned: str, heuristic: str) -> str:
+def comparison_table(run: Run, pairs: Sequence[Pair]) -> str:
     """Return the chosen learned policy against the chosen heuristic, per threshold and occlusion."""
-    pairs = [p for p in scores.learned_pairs(run.trials) if (p[0][0], p[1][0]) == (learned, heuristic)]
     thresholds = run.protocol.thresholds
     rows = [
         [
@@ -115,21 +115,20 @@ def _verdict(found: scores.Comparison) -> str:
     return f"not worse by {100 * MARGIN:.0f}" if found.interval[0] > -MARGIN else "open"
 
 
-def distance_table(run: Run, learned: str, heuristic: str, honest: float | None) -> str:
+def distance_table(run: Run, pairs: Sequence[Pair], honest: float | None) -> str:
     """Return which share of the distance from the heuristic to the best possible view the learned policy covers."""
     bound = next(t for t in run.protocol.thresholds if (t.position_m, t.rotation_deg) == JUDGED)
     groups = scores.group(run.trials)
     lucky = scores.recall(groups[scores.BEST_POSSIBLE, None], bound, pose=run.protocol.pose)
     rows = []
-    for occlusion in (True, False):
-        ours, theirs = (
-            scores.recall(groups[policy, occlusion], bound, pose=run.protocol.pose) for policy in (learned, heuristic)
-        )
+    for pair in pairs:
+        ours, theirs = (scores.recall(groups[variant], bound, pose=run.protocol.pose) for variant in pair)
         cells = [f"{100 * _share(ours, theirs, best):.0f} %" for best in (lucky, honest) if best is not None]
-        rows.append(["yes" if occlusion else "no", f"{100 * theirs:.1f}", f"{100 * ours:.1f}", *cells])
+        named = [f"{policy} {100 * value:.1f}" for (policy, _), value in zip(pair, (ours, theirs), strict=True)]
+        rows.append(["yes" if pair[0][1] else "no", *named, *cells])
     names = [f"of the distance to {100 * lucky:.1f} (lucky)"]
     names += [] if honest is None else [f"to {100 * honest:.1f} (repeatable)"]
-    return markdown(["occlusion", heuristic, learned, *names], rows)
+    return markdown(["occlusion", "learned", "heuristic", *names], rows)
 
 
 def _share(ours: float, theirs: float, best: float) -> float:
@@ -192,17 +191,19 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("run", type=Path)
     parser.add_argument("--learned", default="vpt")
-    parser.add_argument("--heuristic", default="max")
+    parser.add_argument("--heuristics", nargs=2, default=("max", "angle"), help="with and without the filter")
     parser.add_argument("--repeatable", action="store_true")
     parser.add_argument("--curves", type=Path)
     parser.add_argument("--reliability", type=Path)
     args = parser.parse_args()
     run = read_run(args.run)
     print(recall_table(run), end="\n\n")
-    if any(p[0][0] == args.learned and p[1][0] == args.heuristic for p in scores.learned_pairs(run.trials)):
-        print(comparison_table(run, args.learned, args.heuristic), end="\n\n")
-        honest = repeatable(args.dataset) if args.repeatable else None
-        print(distance_table(run, args.learned, args.heuristic, honest))
+    chosen = zip((True, False), args.heuristics, strict=True)
+    wanted = [((args.learned, occlusion), (heuristic, occlusion)) for occlusion, heuristic in chosen]
+    pairs = [p for p in wanted if p in scores.learned_pairs(run.trials)]
+    if pairs:
+        print(comparison_table(run, pairs), end="\n\n")
+        print(distance_table(run, pairs, repeatable(args.dataset) if args.repeatable else None))
     found = said_and_true(args.dataset, run)
     if found:
         print("", reliability_table(found), sep="\n")
