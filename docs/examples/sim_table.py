@@ -1,9 +1,10 @@
 """Print the simulation table of a run on a dataset as Markdown: recall, paired comparisons, distance to the best view.
 
 ``python docs/examples/sim_table.py DATASET RUN --learned vpt --heuristics max angle``, where RUN was written by
-``fieldkit replay DATASET``, and the policies (heuristics with and without the occlusion filter) are those that were best on the validation scene. With ``--repeatable`` the
-candidates that succeeded are localized again, so that best possible is also told without its luck (minutes).
-``--curves FILE.svg`` draws the cumulative errors, ``--reliability FILE.svg`` what learned policies said and what came.
+``fieldkit replay DATASET``, and the policies (heuristics with and without the occlusion filter) are those that were
+best on the validation scene. With ``--repeatable`` the candidates that succeeded are localized again, so that best
+possible is also told without its luck (minutes). ``--curves FILE.svg`` draws the cumulative errors, ``--reliability
+FILE.svg`` what learned policies said and what came.
 """
 
 from __future__ import annotations
