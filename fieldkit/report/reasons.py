@@ -45,6 +45,7 @@ def reasons_svg(plan: VisitPlan, view: PlanView, *, order: Sequence[str], name: 
             )
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[])
             axes.set_aspect("equal")
+            _draw_metre(axes, low, high)
         for axes in panels[len(shown) :]:
             axes.set_visible(False)
         return svg_text(figure, name=name, label=f"Landmarks on which learned scores at {plan.prior.visit} rest")
@@ -90,6 +91,13 @@ def _draw_view(axes: Axes, plan: VisitPlan, view: str, reach: float) -> None:
         along = ray[:2] / max(float(np.linalg.norm(ray[:2])), 1e-9)
         axes.plot(*zip(here, here + reach * along, strict=True), color=INK, linewidth=0.7, alpha=0.55, zorder=2)
     axes.plot(*here, marker="s", markersize=4.5, color="white", markeredgecolor=INK, zorder=5)
+
+
+def _draw_metre(axes: Axes, low: Array, high: Array) -> None:
+    """Draw one metre into the lower left corner: the panels have no axes."""
+    x, y = low + 0.05 * (high - low)
+    axes.plot([x, x + 1.0], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", zorder=4)
+    axes.annotate("1 m", (x, y), xytext=(0, 3), textcoords="offset points", fontsize=8.5, color=INK, zorder=4)
 
 
 def _extent(plan: VisitPlan, reasons: Sequence[Reason]) -> tuple[Array, Array]:
