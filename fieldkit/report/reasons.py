@@ -15,21 +15,22 @@ from fieldkit.report.palette import style
 from fieldkit.types import Array, PlanView, Reason, VisitPlan
 
 RAISED, LOWERED, INK, PALE = "#17798a", "#c2410c", "#14181c", "#c3ccd4"
-# Panels beside each other, and the size of each in inches
-_COLUMNS, _SIDE = 3, 3.1
+# Size of a panel in inches
+_SIDE = 3.1
 
 
 def reasons_svg(plan: VisitPlan, view: PlanView, *, order: Sequence[str], name: str) -> str | None:
     """Draw for each learned policy what the score of the view that it prefers rests on; None without such a policy.
 
     Dots are the landmarks that were asked for, at their place from above: their area is how much leaving out just this
-    one changes the log-odds, in units of the policy's largest change there. Lines bound what the camera sees.
+    one changes the log-odds, in units of the policy's largest change there. Lines bound what the camera sees. A column
+    is a policy, without occlusion above with.
     """
-    shown = sorted(plan.reasons.items(), key=lambda item: (order.index(item[0][0]), bool(item[0][1])))
+    shown = sorted(plan.reasons.items(), key=lambda item: (bool(item[0][1]), order.index(item[0][0])))
     if not shown:
         return None
     low, high = _extent(plan, [reason for _, reason in shown])
-    columns = min(len(shown), _COLUMNS)
+    columns = len({policy for (policy, _), _ in shown})
     rows = math.ceil(len(shown) / columns)
     with matplotlib.rc_context(SETTINGS | {"font.size": 9.0}):
         figure = Figure(figsize=(_SIDE * columns, (_SIDE + 0.35) * rows), layout="constrained")
