@@ -23,6 +23,7 @@ def map_build(
     feature: str = "sift",
     matcher: Literal["nearest", "lightglue"] = "nearest",
     retrieval: Literal["own", "efficientnet", "dinov2"] = "own",
+    appearance: Literal["none", "efficientnet", "dinov2"] = "none",
     weights: Path | None = None,
     poses: Literal["slam", "known", "none"] = "slam",
     scale: Literal["auto", "slam", "tags", "depth"] = "auto",
@@ -41,6 +42,7 @@ def map_build(
         feature: local feature of landmarks: sift, sift_l2, akaze, aliked, aliked_n16, aliked_t16, xfeat, superpoint
         matcher: how pairs of mapping images are matched: nearest neighbours, or lightglue (aliked, aliked_n16; slow)
         retrieval: by what images to be localized find mapping images: descriptors of their landmarks, or a network's
+        appearance: network whose view of the landmarks the map keeps, for the policies with appearance
         weights: folder where the weights of networks are looked for first
         poses: slam gives scale, frame and gravity; known takes the poses as they are; none does not read them
         scale: from what; auto takes tags where --size-m is given, else calibrated depth images, else SLAM
@@ -65,6 +67,8 @@ def map_build(
     try:
         with ProgressBars() as progress:
             built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
+            if appearance != "none":
+                maps.add_appearance(out, source, network=appearance, weights=weights, progress=progress)
     except KeyboardInterrupt:
         _log.warning("%s: interrupted; the same command goes on where it stopped", out)
         raise

@@ -123,11 +123,10 @@ def replay(
 
 
 def _excluded_rows(scene_map: SceneMap, protocol: Protocol, learned: Sequence[Excluded]) -> tuple[Excluded, ...]:
-    """Return the rows that weights or map leave out, with a warning for each."""
+    """Return the rows that weights or map leave out, with a warning for each reason."""
     unfiltered = policies.unfiltered(scene_map, protocol)
     result = (*(() if unfiltered is None else (unfiltered,)), *learned)
-    for item in result:
-        log.warning("%s: excluded: %s", item.what, item.reason)
+    policies.warn_excluded(result)
     return result
 
 

@@ -168,7 +168,9 @@ def rewritten(path: Path, *, about: dict[str, Any] | None = None, tensors: dict[
         ({"landmark_cap": 0}, ">= 1"),
         ({"bias": float("nan")}, "has the bias nan"),
         ({"normalisation": {"full_distance_m": 8.0}}, "features with full_angle_deg None; this version computes"),
-        ({"appearance": "efficientnet"}, "is a vpt with the appearance 'efficientnet'"),
+        ({"appearance": "efficientnet"}, "is a vpt with the appearance 'efficientnet'; expected vpt_appearance"),
+        ({"kind": "vpt_dino", "appearance": "efficientnet"}, "is a vpt_dino with the appearance 'efficientnet'"),
+        ({"kind": "vpt_dino"}, "is a vpt_dino with the appearance None; expected mlp or vpt"),
         ({"kind": "vpt_dino", "appearance": "dinov2"}, "its reduction of appearance has the shapes {}"),
     ],
 )

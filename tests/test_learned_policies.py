@@ -7,18 +7,20 @@ import logging
 import shutil
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
 from seeded_weights import seeded, write_seeded
 from test_policies import look, make_candidates, make_map
+from tiny_source import SOURCE
 
 from fieldkit import policies, protocol, scores, store
 from fieldkit.dataset import replay_datasets
 from fieldkit.errors import MapError, PolicyError, WeightsError
 from fieldkit.features.appearance import APPEARANCES
 from fieldkit.learned.checkpoint import write_checkpoint
-from fieldkit.maps import load_map
+from fieldkit.maps import add_appearance, load_map
 from fieldkit.maps.appearance import appearance_path, write_appearance
 from fieldkit.policies import learned
 from fieldkit.protocol import OcclusionRules, Protocol, Threshold
@@ -272,3 +274,24 @@ def test_appearance_is_added_beside_a_map_and_belongs_to_it(whole: Path, tmp_pat
     appearance_path(lab, "efficientnet").write_bytes(b"PK\x03\x04 cut off")
     with pytest.raises(MapError, match="cannot be read"):
         load_map(lab)
+
+
+def test_appearance_needs_the_images_of_the_map(whole: Path, tmp_path: Path) -> None:
+    entry = read_scene(whole, read_dataset(whole).scenes[0])
+    lab = Path(shutil.copytree(map_path(whole, entry), tmp_path / "lab.map"))
+    source = tmp_path / "source"
+    source.mkdir()
+    SOURCE.write_mapping(source)
+    (source / "images" / "03.png").rename(source / "images" / "other.png")
+    with pytest.raises(MapError, match=r"source: has no image '03\.png' of the map .*lab\.map"):
+        add_appearance(lab, source)
+    (source / "images" / "other.png").rename(source / "images" / "03.png")
+    add_appearance(lab, source)
+    known = load_map(lab)
+    found = known.appearance["efficientnet"].astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=2e-3)
+    # Landmarks of one wall are seen by the same network at different places: they differ, yet not at random.
+    assert 0.0 < np.ptp(found @ found[0]) < 1.0
+    cv2.imwrite(str(source / "images" / "05.png"), np.zeros((100, 80), np.uint8))
+    with pytest.raises(MapError, match=r"05\.png: is 80x100; expected 320x240"):
+        add_appearance(lab, source)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from seeded_weights import write_seeded
 from transcode import transcode
 
 from fieldkit import maps, protocol, scores, store
@@ -193,6 +194,27 @@ def test_what_cannot_be_scored_is_left_out_with_its_reason(tmp_path: Path, short
     (left_out,) = (e for e in run.excluded if e.what not in LEARNED)
     assert left_out.what == "two/w02"
     assert left_out.reason
+
+
+def test_learned_policies_choose_and_say_why(tmp_path: Path, short: Path) -> None:
+    weights = write_seeded(tmp_path / "weights", "mlp", "vpt")
+    run = replay(
+        [short],
+        map_path=SAMPLE / "lab.map",
+        tags_path=SAMPLE / "tags.toml",
+        protocol=PAPER,
+        policy_weights=weights,
+        out=tmp_path / "run",
+    )
+    (plan,) = store.read_run(tmp_path / "run").plans
+    assert set(plan.reasons) == {(name, use) for name in ("mlp", "vpt") for use in (False, True)}
+    for variant, reason in plan.reasons.items():
+        chosen = plan.candidates.view_ids.index(reason.view)
+        assert plan.utilities[variant][chosen] == plan.utilities[variant].max()
+        x_in_cam = plan.candidates.map_from_cam[chosen].inv().apply(reason.landmarks.astype(np.float64))
+        assert plan.candidates.camera.project(x_in_cam)[1].mean() > 0.99
+        assert np.isfinite(reason.raised).all()
+    assert set(run.weights) == {"mlp", "vpt"}
 
 
 def test_scores_and_report_need_no_image_bag_or_map(tmp_path: Path, run_folder: Path) -> None:

@@ -111,6 +111,19 @@ def test_all_features_are_in_0_to_1_and_finite(scene_map: SceneMap) -> None:
                 assert features.max(initial=0.0) <= 1.0
 
 
+def test_a_landmark_that_mapping_never_saw_has_features_too(scene_map: SceneMap) -> None:
+    keep = scene_map.observation_landmark % 2 == 0
+    fields = ("observation_landmark", "observation_image", "observation_px")
+    half = dataclasses.replace(scene_map, **{f: getattr(scene_map, f)[keep] for f in fields})
+    (seen,) = see(half, look([-1, 0, 0], 20))
+    assert (seen.landmark % 2 == 1).any()
+    for features in (tokens_of(half, seen), histograms_of(half, seen)):
+        assert np.isfinite(features).all()
+        assert features.min() >= 0.0
+        assert features.max() <= 1.0
+    assert counts(histograms_of(half, seen))[42:52].sum() == len(seen.landmark)
+
+
 def test_a_view_that_sees_nothing_has_no_token_and_zero_histograms(scene_map: SceneMap) -> None:
     (seen,) = see(scene_map, look([50, 0, 0], 0))
     assert tokens_of(scene_map, seen).shape == (0, TOKEN_WIDTH)

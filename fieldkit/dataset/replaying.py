@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import cast
@@ -46,7 +45,6 @@ from fieldkit.types import (
 )
 from fieldkit.views import forward_directions, plan_view
 
-log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 
 
@@ -96,8 +94,7 @@ def replay_datasets(
         )
     checkpoints, lacking = _servable(scenes, checkpoints)
     excluded = (*unweighted, *lacking)
-    for item in excluded:
-        log.warning("%s: excluded: %s", item.what, item.reason)
+    policies.warn_excluded(excluded)
     parts = [_replay_scene(scene, protocol, checkpoints, progress=progress) for scene in scenes]
     run = Run(
         protocol=protocol,

@@ -142,10 +142,11 @@ def _about(header: str, path: Path) -> About:
             f"them with {now.get(other)}",
             hint="train again, or use the version that trained it",
         )
-    if (about.appearance is not None) != (about.kind in ("vpt_dino", "vpt_appearance")):
+    fitting = {None: ("mlp", "vpt"), "dinov2": ("vpt_dino",)}.get(about.appearance, ("vpt_appearance",))
+    if about.kind not in fitting:
         raise WeightsError(
-            f"{path}: is a {about.kind} with the appearance {about.appearance!r}; expected one where the policy uses "
-            "appearance, and only there",
+            f"{path}: is a {about.kind} with the appearance {about.appearance!r}; expected {' or '.join(fitting)} with "
+            "it: no policy stands in for another under its name",
             hint="train again",
         )
     return about

@@ -32,19 +32,20 @@ def add_appearance(
     the source or has another size, WeightsError when the network's weights are not found.
     """
     scene_map = load_map(Path(path))
-    seeing = open_appearance(network, weights=weights)
     walk = source if isinstance(source, MapSource) else open_source(Path(source))
     by_name = {image.name: image for image in walk.images}
+    missing = next((name for name in scene_map.image_names if name not in by_name), None)
+    if missing is not None:
+        raise MapError(
+            f"{walk.path}: has no image {missing!r} of the map {path}; expected the images that it was made of",
+            hint="name the folder from which the map was built",
+        )
+    seeing = open_appearance(network, weights=weights)
     bounds = np.searchsorted(scene_map.observation_image, np.arange(len(scene_map.image_names) + 1))
     total = np.zeros((len(scene_map.xyz), seeing.kind.dense_width), dtype=np.float32)
     for i, name in enumerate(scene_map.image_names):
         if progress is not None:
             progress("appearance", i + 1, len(scene_map.image_names))
-        if name not in by_name:
-            raise MapError(
-                f"{walk.path}: has no image {name!r} of the map {path}; expected the images that it was made of",
-                hint="name the folder from which the map was built",
-            )
         image, camera = read_image(by_name[name], colour=True), scene_map.image_cameras[i]
         if image.shape[:2] != (camera.height, camera.width):
             raise MapError(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from fieldkit.surface import RayCaster
 from fieldkit.types import Candidates, Excluded, Reason, SceneMap
 from fieldkit.views import HeatMaps, landmark_statistics
 
+log = logging.getLogger(__name__)
 Variant = tuple[str, bool | None]
 
 
@@ -45,6 +47,12 @@ def unfiltered(scene_map: SceneMap, protocol: Protocol) -> Excluded | None:
         f"{', '.join(counting)} with occlusion",
         f"{scene_map.path} has no surface: nothing tells which landmarks are hidden; build the map with depth images",
     )
+
+
+def warn_excluded(rows: Sequence[Excluded]) -> None:
+    """Log which rows are left out: those that share a reason in one line."""
+    for reason in dict.fromkeys(row.reason for row in rows):
+        log.warning("excluded %s: %s", ", ".join(row.what for row in rows if row.reason == reason), reason)
 
 
 class Looker:

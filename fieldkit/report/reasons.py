@@ -15,21 +15,22 @@ from fieldkit.report.palette import style
 from fieldkit.types import Array, PlanView, Reason, VisitPlan
 
 RAISED, LOWERED, INK, PALE = "#17798a", "#c2410c", "#14181c", "#c3ccd4"
-# Panels beside each other, and the size of each in inches
-_COLUMNS, _SIDE = 3, 3.1
+# Size of a panel in inches
+_SIDE = 3.1
 
 
 def reasons_svg(plan: VisitPlan, view: PlanView, *, order: Sequence[str], name: str) -> str | None:
     """Draw for each learned policy what the score of the view that it prefers rests on; None without such a policy.
 
     Dots are the landmarks that were asked for, at their place from above: their area is how much leaving out just this
-    one changes the log-odds, in units of the policy's largest change there. Lines bound what the camera sees.
+    one changes the log-odds, in units of the policy's largest change there. Lines bound what the camera sees. A column
+    is a policy, without occlusion above with.
     """
-    shown = sorted(plan.reasons.items(), key=lambda item: (order.index(item[0][0]), bool(item[0][1])))
+    shown = sorted(plan.reasons.items(), key=lambda item: (bool(item[0][1]), order.index(item[0][0])))
     if not shown:
         return None
     low, high = _extent(plan, [reason for _, reason in shown])
-    columns = min(len(shown), _COLUMNS)
+    columns = len({policy for (policy, _), _ in shown})
     rows = math.ceil(len(shown) / columns)
     with matplotlib.rc_context(SETTINGS | {"font.size": 9.0}):
         figure = Figure(figsize=(_SIDE * columns, (_SIDE + 0.35) * rows), layout="constrained")
@@ -45,6 +46,7 @@ def reasons_svg(plan: VisitPlan, view: PlanView, *, order: Sequence[str], name: 
             )
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[])
             axes.set_aspect("equal")
+            _draw_metre(axes, low, high)
         for axes in panels[len(shown) :]:
             axes.set_visible(False)
         return svg_text(figure, name=name, label=f"Landmarks on which learned scores at {plan.prior.visit} rest")
@@ -90,6 +92,13 @@ def _draw_view(axes: Axes, plan: VisitPlan, view: str, reach: float) -> None:
         along = ray[:2] / max(float(np.linalg.norm(ray[:2])), 1e-9)
         axes.plot(*zip(here, here + reach * along, strict=True), color=INK, linewidth=0.7, alpha=0.55, zorder=2)
     axes.plot(*here, marker="s", markersize=4.5, color="white", markeredgecolor=INK, zorder=5)
+
+
+def _draw_metre(axes: Axes, low: Array, high: Array) -> None:
+    """Draw one metre into the lower left corner: the panels have no axes."""
+    x, y = low + 0.05 * (high - low)
+    axes.plot([x, x + 1.0], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", zorder=4)
+    axes.annotate("1 m", (x, y), xytext=(0, 3), textcoords="offset points", fontsize=8.5, color=INK, zorder=4)
 
 
 def _extent(plan: VisitPlan, reasons: Sequence[Reason]) -> tuple[Array, Array]:

@@ -187,7 +187,9 @@ def view_histograms(seen: SeenLandmarks, statistics: LandmarkStatistics, *, came
     i = seen.landmark
     nearest, farthest = statistics.min_distance_m[i], statistics.max_distance_m[i]
     least, most = statistics.min_angle_rad[i], statistics.max_angle_rad[i]
-    octaves = np.log2(seen.distance_m / np.sqrt(nearest * farthest))
+    # A landmark without an observation, as a foreign map may have one, is no nearer or farther than mapping.
+    middle = np.where(nearest * farthest > 0.0, nearest * farthest, np.square(seen.distance_m, dtype=np.float64))
+    octaves = np.log2(seen.distance_m / np.sqrt(np.maximum(middle, 1e-18)))
     u, v = (seen.uv_px / (camera.width, camera.height)).T
     cells = HEAT_CELLS
     column, line = (np.clip((x * cells).astype(np.int64), 0, cells - 1) for x in (u, v))

@@ -54,9 +54,11 @@ def _in_view(
     xyz: Array, map_from_cam: Pose, candidates: Candidates, rules: CandidateRules
 ) -> tuple[NDArray[np.int32], Array, NDArray[np.float32]]:
     """Return the landmarks in view, their positions in the camera, and their pixels."""
-    x_in_cam = map_from_cam.inv().apply(xyz)
-    distance = np.linalg.norm(x_in_cam, axis=1)
-    near = np.flatnonzero((distance >= rules.min_distance_m) & (distance <= rules.max_distance_m))
+    x_in_cam = (xyz - map_from_cam.translation) @ map_from_cam.rotation.as_matrix()
+    squared = np.einsum("ij,ij->i", x_in_cam, x_in_cam)
+    # What lies behind the camera is in no image: half of a map need not be projected.
+    ahead = (x_in_cam[:, 2] > 0.0) & (squared >= rules.min_distance_m**2) & (squared <= rules.max_distance_m**2)
+    near = np.flatnonzero(ahead)
     pixels, in_image = candidates.camera.project(x_in_cam[near])
     seen = near[in_image]
     return seen.astype(np.int32), x_in_cam[seen], pixels[in_image].astype(np.float32)
