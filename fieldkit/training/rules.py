@@ -63,7 +63,7 @@ class TrainingRules:
         whole = self.model == "mlp"
         return dataclasses.replace(
             self,
-            epochs=_given(self.epochs, 12 if whole else 8),
+            epochs=_given(self.epochs, 8),
             batch=_given(self.batch, 400 if whole else 64),
             cap=None if whole else _given(self.cap, 256),
             drawn=None if whole else min(_given(self.drawn, 64), _given(self.cap, 256)),
