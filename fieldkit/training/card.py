@@ -94,8 +94,9 @@ def _settings(rules: TrainingRules, history: Sequence[Epoch]) -> str:
         [
             "## Training",
             "",
-            f"Settings: {settings}. Classes weigh the same. Kept: the epoch with the best choices in the",
-            "validation scene (the best of half of a waypoint's candidates localizes; with and without the filter).",
+            f"Settings: {settings}. Classes weigh the same. Kept: the epoch with the least validation loss",
+            "(calibrated, with and without the occlusion filter). Chosen well: the best of half of a waypoint's",
+            "candidates localizes.",
             "",
             "| epoch | loss | validation loss | % chosen well |",
             "|---|---|---|---|",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.training.calibrating import chosen_share, log_loss
+from fieldkit.training.calibrating import chosen_share, fit_calibration, log_loss
 from fieldkit.training.inputs import Inputs
 from fieldkit.training.resuming import Epoch, State, read_state, write_state
 from fieldkit.training.rules import TrainingRules
@@ -62,7 +62,7 @@ def fit(
     """Fit a network; after every epoch its state is kept beside ``out``, from which the same call goes on.
 
     With ``force`` the state of another training there is replaced, else it raises TrainingError.
-    Classes weigh the same, whatever their numbers. The epoch whose choices in the validation scene are best is kept.
+    Classes weigh the same, whatever their numbers. The epoch with the least loss in the validation scene is kept.
     """
     import torch
 
@@ -80,7 +80,7 @@ def fit(
             odds = _log_odds(network, material.validation)
             now = Epoch(loss, *_judged(odds, material))
             history = (*history, now)
-            if kept is None or _rank(now) > _rank(history[best]):
+            if kept is None or now.validation_loss < history[best].validation_loss:
                 best, kept = len(history) - 1, _arrays(network.state_dict())
             write_state(out, State(_arrays(network.state_dict()), _moments(optimizer), kept, best, history), key=key)
             if progress is not None:
@@ -90,15 +90,11 @@ def fit(
         return Fitted(kept, best, history, _log_odds(network, material.validation))
 
 
-def _rank(epoch: Epoch) -> tuple[float, float]:
-    return epoch.chosen, -epoch.validation_loss
-
-
 def _told(rules: TrainingRules, history: tuple[Epoch, ...], best: int) -> str:
     now = history[-1]
     return (
         f"train {rules.model} | loss {now.loss:.3f}, validation loss {now.validation_loss:.3f}, chosen well "
-        f"{100 * now.chosen:.1f} % (best {100 * history[best].chosen:.1f} % after epoch {best + 1})"
+        f"{100 * now.chosen:.1f} % (least loss {history[best].validation_loss:.3f} after epoch {best + 1})"
     )
 
 
@@ -191,10 +187,16 @@ def _log_odds(network: torch.nn.Module, inputs: Inputs) -> Array:
 
 
 def _judged(odds: Array, material: Material) -> tuple[float, float]:
+    """Return the loss of the validation views once their probabilities are calibrated, and how well views are chosen.
+
+    The loss tells epochs apart better than the choices at a scene's hundred waypoints, which chance decides.
+    """
     label = material.validation.label
+    every = np.tile(label, len(odds))
+    calibrated = fit_calibration(odds.ravel(), every)
     half = max(int(np.bincount(material.waypoint).max()) // 2, 1)
-    loss = float(np.mean([log_loss(row, label) for row in odds]))
-    return loss, float(np.mean([chosen_share(row, label, material.waypoint, of=half) for row in odds]))
+    chosen = float(np.mean([chosen_share(row, label, material.waypoint, of=half) for row in odds]))
+    return log_loss(odds.ravel() / calibrated.temperature + calibrated.bias, every), chosen
 
 
 def _tensor(values: NDArray[Any]) -> torch.Tensor:

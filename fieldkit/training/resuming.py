@@ -23,8 +23,8 @@ WHAT = "the state of an unfinished training"
 class Epoch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What one pass over the training views came to.
 
-    ``loss`` of training, ``validation_loss`` and ``chosen``: the share of validation waypoints whose best view of half
-    of the candidates localizes, with and without the occlusion filter in equal parts.
+    ``loss`` of training, ``validation_loss`` with calibrated probabilities, and ``chosen``: the share of validation
+    waypoints whose best view of half of the candidates localizes, with and without the occlusion filter in equal parts.
     """
 
     loss: float

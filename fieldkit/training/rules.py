@@ -17,8 +17,8 @@ APPEARANCE_OF: dict[str, str] = {"vpt_appearance": "efficientnet", "vpt_dino": "
 class TrainingRules:
     """Settings of a training; those that the defaults leave open depend on the model (`settled`).
 
-    ``epochs`` passes over the training views at most, and ``patience`` of them without a better choice of views in
-    the validation scene end it early. Every step takes ``batch`` views; the learning rate rises to ``learning_rate``
+    ``epochs`` passes over the training views at most, and ``patience`` of them without a smaller loss in the
+    validation scene end it early. Every step takes ``batch`` views; the learning rate rises to ``learning_rate``
     and falls as a cosine. ``occluded`` is the share of the views that are shown without the landmarks behind the
     surface, the others with all: one network serves both. ``cap``: landmarks of a view that are looked at, at most;
     ``drawn``: of how many it learns at most, others each time, which is cheaper and keeps it from learning by heart.
