@@ -53,6 +53,7 @@ def map_build(
     """
     from fieldkit import maps
     from fieldkit.calibrate import parse_sizes
+    from fieldkit.features.appearance import open_appearance
 
     options = maps.MapOptions(
         matcher=matcher,
@@ -64,6 +65,9 @@ def map_build(
         tag_families=family or ("tag36h11",),
         voxel_m=voxel_m,
     )
+    if appearance != "none":
+        # Weights that are missing are missed before hours of work
+        open_appearance(appearance, weights=weights)
     try:
         with ProgressBars() as progress:
             built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)

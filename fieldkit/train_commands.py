@@ -26,6 +26,7 @@ def train(
     test: Repeated[tuple[Path, ...]] = (),
     seed: int = 0,
     epochs: int | None = None,
+    patience: int = 3,
     cap: int | None = None,
     drawn: int | None = None,
     json: bool = False,
@@ -43,6 +44,7 @@ def train(
         test: dataset of test scenes: none of them may be trained or validated on; may be repeated
         seed: seed of weights, order and variations
         epochs: how often the training views are gone over at most
+        patience: epochs without a smaller loss in the validation scene that end it early
         cap: landmarks of a view that are looked at, at most; by default 256
         drawn: landmarks of a view that it learns from at a time, at most; by default 64
         json: print JSON
@@ -53,7 +55,7 @@ def train(
     from fieldkit.training import TrainingRules
     from fieldkit.training import train as train_policy
 
-    rules = TrainingRules(model=model, seed=seed, epochs=epochs, cap=cap, drawn=drawn)
+    rules = TrainingRules(model=model, seed=seed, epochs=epochs, patience=patience, cap=cap, drawn=drawn)
     try:
         with ProgressBars() as progress:
             report = train_policy(

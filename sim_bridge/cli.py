@@ -189,7 +189,7 @@ class _ProgressLines:
         left = "" if at.seconds_left is None else f", {at.seconds_left / 60:.1f} min left"
         speed = "preparing" if at.images_s is None else f"{at.images_s:.1f} views/s"
         where = ", ".join(at.what)
-        logging.getLogger(__name__).info("%d of %d waypoints, %s%s | %s", at.done, at.total, speed, left, where)
+        logging.getLogger(__name__).info("%d of %d %s, %s%s | %s", at.done, at.total, at.unit, speed, left, where)
 
 
 def export(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from fieldkit.dataset import (
     add_appearances,
     count_scenes,
     make_dataset,
+    open_weights,
 )
 from fieldkit.errors import suggestion
 from fieldkit.frames import Pose, exp
@@ -268,6 +270,8 @@ def make_scenes(
     )
     rules = DatasetRules(feature=options.feature, repeats=options.repeats, repeat_share=options.repeat_share)
     sources = [_source(name, chosen, options.mesh) for name in scenes]
+    if options.appearance is not None:
+        open_weights(options.appearance)
     make_dataset(
         sources,
         out,
@@ -278,8 +282,20 @@ def make_scenes(
         progress=progress,
     )
     if options.appearance is not None:
-        add_appearances(sources, out, network=options.appearance)
+        add_appearances(sources, out, network=options.appearance, progress=_told(progress))
     return count_scenes(out)
+
+
+def _told(progress: Callable[[Progress], None] | None) -> Callable[[str, int, int], None] | None:
+    """Return what tells steps of one scene after the other as progress of a dataset whose views are all there."""
+    if progress is None:
+        return None
+    begin = time.monotonic()
+
+    def tell(what: str, done: int, total: int) -> None:
+        progress(Progress((what,), done, total, None, time.monotonic() - begin, None, "images"))
+
+    return tell
 
 
 def _check_names(scenes: Sequence[str]) -> None:

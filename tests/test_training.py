@@ -17,7 +17,15 @@ from fieldkit.learned.checkpoint import read_checkpoint
 from fieldkit.learned.scoring import Scorer
 from fieldkit.maps import load_map
 from fieldkit.maps.appearance import write_appearance
-from fieldkit.store.datasets import map_path, read_dataset, read_scene, shard_path, write_dataset
+from fieldkit.store.datasets import (
+    map_path,
+    read_dataset,
+    read_scene,
+    read_shard,
+    shard_path,
+    write_dataset,
+    write_shard,
+)
 from fieldkit.training import (
     TrainingRules,
     chosen_share,
@@ -62,7 +70,7 @@ def kill_after(epochs: int):  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("model", ["mlp", "vpt"])
 def test_the_same_seed_gives_the_same_bytes_also_after_a_kill(views: Path, tmp_path: Path, model: str) -> None:
-    rules = dataclasses.replace(QUICK, model=model)
+    rules = QUICK if model == "vpt" else TrainingRules("mlp", epochs=3, batch=24)
     train([views], tmp_path / "whole" / "x.safetensors", rules=rules)
     broken = tmp_path / "broken" / "x.safetensors"
     for epochs in (1, 2):
@@ -90,6 +98,42 @@ def test_a_trained_network_chooses_views_that_localize_in_a_scene_it_never_saw(v
     scores = scorer.scores(list(np.asarray(histograms, dtype=np.float32)))
     assert chosen_share(scores, scene.label, scene.waypoint) == pytest.approx(filtered.chosen)
     assert np.mean((scores - scene.label) ** 2) == pytest.approx(filtered.reliability.brier, abs=1e-5)
+
+
+def test_a_training_that_gains_nothing_ends_early(own: Path, tmp_path: Path, rng: np.random.Generator) -> None:
+    for path in sorted((own / "c").glob("*.npz")):
+        shard = read_shard(path)
+        write_shard(path, dataclasses.replace(shard, label=rng.random(len(shard.label)) < 0.5))
+    rules = TrainingRules("mlp", epochs=40, patience=2, batch=24, learning_rate=3e-3)
+    report = train([own], tmp_path / "x.safetensors", rules=rules, validate="c")
+    assert report.epochs == report.best + rules.patience
+    assert report.epochs < 40
+
+
+def test_without_a_name_the_scene_of_median_difficulty_validates(own: Path) -> None:
+    relabel(own, "a", label=True)
+    relabel(own, "b", label=False)
+    assert split_scenes(find_scenes([own])).validation.name == "c"
+    relabel(own, "c", label=True)
+    assert split_scenes(find_scenes([own])).validation.name == "a"
+
+
+def test_other_appearance_is_other_data(own: Path, tmp_path: Path, rng: np.random.Generator) -> None:
+    rules, out = dataclasses.replace(QUICK, model="vpt_appearance"), tmp_path / "x.safetensors"
+    with_appearance(own, rng)
+    with pytest.raises(Killed):
+        train([own], out, rules=rules, progress=kill_after(1))
+    with_appearance(own, rng)
+    with pytest.raises(TrainingError, match=r"with other settings, data or program"):
+        train([own], out, rules=rules)
+
+
+def test_a_landmark_that_the_map_lacks_is_named(own: Path, tmp_path: Path) -> None:
+    path = shard_path(own, "b", "w1")
+    shard = read_shard(path)
+    write_shard(path, dataclasses.replace(shard, landmark=shard.landmark + 5000))
+    with pytest.raises(DatasetError, match=r"w1\.npz: sees the landmark 5\d\d\d; expected less than 150"):
+        train([own], tmp_path / "x.safetensors", rules=QUICK)
 
 
 def test_a_checkpoint_says_what_it_was_trained_on(views: Path, tmp_path: Path) -> None:
@@ -296,6 +340,8 @@ def test_what_is_there_is_not_replaced_unless_asked_for(views: Path, tmp_path: P
         train([views], out, rules=QUICK)
     train([views], out, rules=QUICK, force=True)
     assert "mine" not in (tmp_path / "x.md").read_text()
+    with pytest.raises(TrainingError, match=r"x\.md: expected a name that ends in \.safetensors"):
+        train([views], tmp_path / "x.md", rules=QUICK, force=True)
 
 
 @pytest.mark.parametrize(
@@ -307,6 +353,7 @@ def test_what_is_there_is_not_replaced_unless_asked_for(views: Path, tmp_path: P
         ({"seed": -1}, "seed is -1"),
         ({"learning_rate": float("nan")}, "learning_rate is nan"),
         ({"occluded": 1.5}, "occluded is 1.5"),
+        ({"model": "mlp", "cap": 7}, "the model mlp takes all landmarks; expected no cap"),
     ],
 )
 def test_settings_that_cannot_be_used_are_named(changes: dict[str, float], said: str) -> None:

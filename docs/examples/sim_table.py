@@ -1,10 +1,10 @@
 """Print the simulation table of a run on a dataset as Markdown: recall, paired comparisons, distance to the best view.
 
 ``python docs/examples/sim_table.py DATASET RUN --learned vpt --heuristics max angle``, where RUN was written by
-``fieldkit replay DATASET``, and the policies (heuristics with and without the occlusion filter) are those that were
-best on the validation scene. With ``--repeatable`` the candidates that succeeded are localized again, so that best
-possible is also told without its luck (minutes). ``--curves FILE.svg`` draws the cumulative errors, ``--reliability
-FILE.svg`` what learned policies said and what came.
+``fieldkit replay DATASET``, and the policies (heuristics with and without the occlusion filter) are those that
+were best in the training and validation scenes. With ``--repeatable`` the candidates that succeeded are localized
+again, so that best possible is also told without its luck (minutes). ``--curves FILE.svg`` draws the cumulative errors,
+``--reliability FILE.svg`` what learned policies said and what came.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fieldkit.dataset.worker import views_key
 from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer, Query
 from fieldkit.maps import load_map
-from fieldkit.protocol import LEARNED
+from fieldkit.protocol import LEARNED, Threshold
 from fieldkit.report.figures import curve_svg
 from fieldkit.store import read_run
 from fieldkit.store.datasets import DatasetRules, Shard, map_path, read_dataset, read_scene, read_scene_shard, row_pose
@@ -89,9 +89,8 @@ def recall_table(run: Run) -> str:
     return "\n".join(lines)
 
 
-def comparison_table(run: Run, pairs: Sequence[Pair]) -> str:
-    """Return the chosen learned policy against the chosen heuristic, per threshold and occlusion."""
-    thresholds = run.protocol.thresholds
+def comparison_table(run: Run, pairs: Sequence[Pair], thresholds: Sequence[Threshold]) -> str:
+    """Return learned policies against heuristics, per threshold and occlusion."""
     rows = [
         [
             f"{c.a[0]} - {c.b[0]}",
@@ -201,9 +200,15 @@ def main() -> None:
     print(recall_table(run), end="\n\n")
     chosen = zip((True, False), args.heuristics, strict=True)
     wanted = [((args.learned, occlusion), (heuristic, occlusion)) for occlusion, heuristic in chosen]
-    pairs = [p for p in wanted if p in scores.learned_pairs(run.trials)]
-    if pairs:
-        print(comparison_table(run, pairs), end="\n\n")
+    known = scores.learned_pairs(run.trials)
+    pairs = [p for p in wanted if p in known]
+    if not pairs:
+        print(f"no rows of {args.learned} and {' and '.join(args.heuristics)} to compare", file=sys.stderr)
+    else:
+        bound = [t for t in run.protocol.thresholds if (t.position_m, t.rotation_deg) == JUDGED]
+        own = [p for p in known if p[0][0] == args.learned]
+        print(comparison_table(run, own, bound), end="\n\n")
+        print(comparison_table(run, pairs, run.protocol.thresholds), end="\n\n")
         print(distance_table(run, pairs, repeatable(args.dataset) if args.repeatable else None))
     found = said_and_true(args.dataset, run)
     if found:

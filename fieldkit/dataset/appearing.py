@@ -12,7 +12,13 @@ from fieldkit.dataset.folder import WORK_FOLDER, own, tidy
 from fieldkit.dataset.source import ViewSource
 from fieldkit.dataset.worker import map_key
 from fieldkit.errors import DatasetError
+from fieldkit.features.appearance import open_appearance
 from fieldkit.store.datasets import map_path, read_dataset, read_scene
+
+
+def open_weights(network: str, *, weights: Path | None = None) -> None:
+    """Find and read a network's weights, to miss them before hours of work; raises WeightsError without."""
+    open_appearance(network, weights=weights)
 
 
 def add_appearances(

@@ -34,7 +34,7 @@ ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NU
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a dataset is: what each worker does, shards done and in all, and seconds since the start.
+    """How far a dataset is: what each worker does, how many ``unit`` are done and in all, and seconds since the start.
 
     ``images_s`` are the images localized per second since the first map was there.
     """
@@ -45,6 +45,7 @@ class Progress:
     images_s: float | None
     seconds: float
     seconds_left: float | None
+    unit: str = "waypoints"
 
 
 @dataclasses.dataclass

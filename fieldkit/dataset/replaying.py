@@ -95,6 +95,7 @@ def replay_datasets(
     checkpoints, lacking = _servable(scenes, checkpoints)
     excluded = (*unweighted, *lacking)
     policies.warn_excluded(excluded)
+    policies.warn_known(checkpoints, [s.session for s in scenes])
     parts = [_replay_scene(scene, protocol, checkpoints, progress=progress) for scene in scenes]
     run = Run(
         protocol=protocol,
@@ -129,7 +130,9 @@ def _servable(
             path = map_path(scene.folder, scene.entry)
             if network is not None and network not in maps.known_appearances(path):
                 reason = f"{path} lacks the appearance {network} of its landmarks"
-                lacking.setdefault(name, Excluded(name, f"{reason}; add it with `fieldkit map appearance`"))
+                lacking.setdefault(
+                    name, Excluded(name, f"{reason}; add it with `sim-bridge dataset --appearance {network}`")
+                )
     return {n: c for n, c in checkpoints.items() if n not in lacking}, tuple(lacking.values())
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import StoreError, WeightsError
+from fieldkit.features.appearance import APPEARANCES
 from fieldkit.store.files import atomic_write, convert, digest, plain
 from fieldkit.views.features import normalisation
 
@@ -116,6 +117,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
     about = _about(header, path)
     weights = {n.removeprefix(_NETWORK): t for n, t in tensors.items() if n.startswith(_NETWORK)}
     reduction = _reduction({n: t for n, t in tensors.items() if n.startswith(_APPEARANCE)}, about, path)
+    negative = next((n for n, t in weights.items() if n.endswith("running_var") and (t < 0).any()), None)
+    if negative is not None:
+        raise WeightsError(f"{path}: {negative!r} holds a negative variance; expected none", hint="copy the file again")
     strange = next((n for n in tensors if not n.startswith((_NETWORK, _APPEARANCE))), None)
     if strange is not None:
         raise WeightsError(f"{path}: holds {strange!r}; expected {WHAT}", hint="train again")
@@ -127,7 +131,7 @@ def _about(header: str, path: Path) -> About:
         about = convert(json.loads(header), About, path=path, what=WHAT)
     except StoreError as error:
         raise WeightsError(error.message, hint=error.hint) from error
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise WeightsError(f"{path}: its header is damaged; expected {WHAT}", hint="copy the file again") from error
     if not np.isfinite([about.bias, about.temperature]).all():
         raise WeightsError(
@@ -159,7 +163,7 @@ def _reduction(tensors: Mapping[str, NDArray[Any]], about: About, path: Path) ->
     names = [field.name for field in dataclasses.fields(Reduction)]
     found = {n.removeprefix(_APPEARANCE): t for n, t in tensors.items()}
     shapes = {n: t.shape for n, t in found.items()}
-    width = shapes.get("mean", (0,))[0:1]
+    width = (APPEARANCES[about.appearance].dense_width,) if about.appearance in APPEARANCES else ()
     expected = {"mean": width, "components": (3, *width), "low": (3,), "high": (3,)}
     finite = all(np.issubdtype(t.dtype, np.floating) and np.isfinite(t).all() for t in found.values())
     if about.appearance is None or shapes != expected or not finite:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 APPEARANCE_WIDTH = 3
+_DIGITS = 5
 # Views of one batch have together at most this many pairs of landmarks: their attention stays in the cache.
 _MOST_PAIRS = 1 << 20
 
@@ -75,7 +76,8 @@ class Scorer:
             for members, inputs in self._batches(views, [len(v) for v in views] if visible is None else visible):
                 logits = self._network(*map(torch.from_numpy, inputs)).double()
                 result[members] = ((logits[:, 1] - logits[:, 0]) / about.temperature + about.bias).numpy()
-        return result
+        # The last bits depend on batches and threads: views that show the same tie
+        return np.round(result, _DIGITS)
 
     def _batches(
         self, views: Sequence[Floats], visible: Sequence[int]

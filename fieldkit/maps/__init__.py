@@ -1,6 +1,6 @@
 """Maps: structure from motion, metric alignment, landmarks and surface, from images to a map folder and back."""
 
-from fieldkit.maps.appearance import known_appearances
+from fieldkit.maps.appearance import appearance_path, known_appearances
 from fieldkit.maps.appearing import add_appearance
 from fieldkit.maps.build import MapReport, build_map
 from fieldkit.maps.compact import compact_map
@@ -25,6 +25,7 @@ __all__ = [
     "MapReport",
     "MapWarp",
     "add_appearance",
+    "appearance_path",
     "build_map",
     "changed",
     "compact_map",

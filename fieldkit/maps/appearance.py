@@ -6,7 +6,6 @@ It may be added to a map at any time: the map's digest does not count it, and th
 from __future__ import annotations
 
 import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -44,11 +43,11 @@ def read_appearances(map_folder: Path, *, digest: str, count: int) -> dict[str, 
     result = {}
     for network in known_appearances(map_folder):
         path = appearance_path(map_folder, network)
-        hint = "remove it, and add it again with `fieldkit map appearance`"
+        hint = "remove it, and add it again with `fieldkit map appearance`, in a dataset with `sim-bridge dataset`"
         try:
             with np.load(path, allow_pickle=False) as archive:
                 made_for, vectors = str(archive["map_digest"]), archive["vectors"]
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        except Exception as error:  # numpy, zip and zlib raise many types for damaged files
             raise MapError(f"{path}: cannot be read: {error}; expected the landmarks' appearance", hint=hint) from error
         shape = (count, APPEARANCES[network].dense_width)
         if made_for != digest or vectors.shape != shape or vectors.dtype != np.float16:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fieldkit.errors import MapError
 from fieldkit.features import Features
+from fieldkit.maps.appearance import write_appearance
 from fieldkit.maps.io import content_digest, load_map, positive, read_map_file, write_features, write_map_file
 from fieldkit.maps.landmarks import Model, model_from_arrays
 from fieldkit.maps.whole import FILE, write_global
@@ -25,7 +26,8 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
     """Write a smaller copy of a map folder that localizes almost as well.
 
     Only keypoints that observe a landmark stay; of a landmark's descriptors the one nearest to their mean stays and
-    the others become zero; the surface is merged to ``voxel_m``. It is a map of its own, with its own digest.
+    the others become zero; the surface is merged to ``voxel_m``; the landmarks' appearance stays. It is a map of its
+    own, with its own digest.
     Raises MapError when the map's descriptors are not 8-bit or ``voxel_m`` is no size.
     """
     refuse_existing(Path(out), force=force, marker="map.toml", kind="folder")
@@ -43,9 +45,10 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
         if surface is not None and surface_entry is not None:
             write_ply(folder / "surface.ply", surface)
             surface_entry = msgspec.structs.replace(surface_entry, voxel_m=surface.voxel_m, file="surface.ply")
-        write_map_file(
-            folder, msgspec.structs.replace(entry, version=1, digest=content_digest(folder), surface=surface_entry)
-        )
+        digest = content_digest(folder)
+        for network, seen in scene_map.appearance.items():
+            write_appearance(folder, network, seen, digest=digest)
+        write_map_file(folder, msgspec.structs.replace(entry, version=1, digest=digest, surface=surface_entry))
 
 
 def _write_model(folder: Path, scene_map: SceneMap) -> None:

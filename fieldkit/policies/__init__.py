@@ -1,7 +1,7 @@
 """Policies rank candidate views from the map and the candidate poses: no image, no estimate, no truth reaches them."""
 
 from fieldkit.policies.learned import Learned, find_checkpoints, open_learned
-from fieldkit.policies.looking import Looker, check_map, unfiltered, warn_excluded
+from fieldkit.policies.looking import Looker, check_map, unfiltered, warn_excluded, warn_known
 from fieldkit.policies.scene import Scene, look_at
 from fieldkit.policies.table import NOT_RANKED, POLICIES, Array, Policy, available, utility
 
@@ -21,4 +21,5 @@ __all__ = [
     "unfiltered",
     "utility",
     "warn_excluded",
+    "warn_known",
 ]

@@ -55,6 +55,16 @@ def warn_excluded(rows: Sequence[Excluded]) -> None:
         log.warning("excluded %s: %s", ", ".join(row.what for row in rows if row.reason == reason), reason)
 
 
+def warn_known(checkpoints: Mapping[str, Checkpoint], scenes: Sequence[str]) -> None:
+    """Log which learned policies are replayed in scenes that they were trained or validated on, by name."""
+    for name, checkpoint in checkpoints.items():
+        about = checkpoint.about
+        for use, own in (("trained", about.training_scenes), ("validated", about.validation_scenes)):
+            known = [scene for scene in scenes if scene in own]
+            if known:
+                log.warning("%s was %s on %s: its rows there are no test", name, use, ", ".join(known))
+
+
 class Looker:
     """Compute every policy's utilities of candidates; landmark statistics, rays and networks are made once per map.
 

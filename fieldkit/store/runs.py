@@ -357,7 +357,7 @@ def _read_arrays(path: Path) -> tuple[ByVisit[Array], ByVisit[Reason], PlanView]
                     )
         with np.load(path / "plan.npz", allow_pickle=False) as archive:
             return utilities, reasons, PlanView(archive["landmarks"], archive["cameras"])
-    except (OSError, KeyError, ValueError) as error:
+    except Exception as error:  # numpy, zip and zlib raise many types for damaged files
         raise StoreError(
             f"{path}: utilities.npz, {REASONS_FILE} or plan.npz: {error}", hint="replay the recording again"
         ) from error

@@ -137,6 +137,12 @@ def read_examples(scene: SceneFolder, *, progress: Progress | None = None) -> Ex
     camera: Camera | None = None
     for number, waypoint in enumerate(scene.entry.waypoints):
         shard = read_scene_shard(scene.folder, scene.entry, waypoint)
+        if shard.landmark.max(initial=-1) >= len(scene_map.xyz):
+            raise DatasetError(
+                f"{shard_path(scene.folder, scene.name, waypoint)}: sees the landmark {shard.landmark.max()}; expected "
+                f"less than {len(scene_map.xyz)}, as many as its map has",
+                hint="remove it and finish the dataset",
+            )
         views = _candidates(shard, scene)
         labels.append(shard.label[views])
         waypoints.append(np.full(len(views), number, dtype=np.int32))
@@ -207,8 +213,8 @@ def split_scenes(scenes: Sequence[SceneFolder], *, validate: str | None = None, 
     """Split scenes into those to train on and one to validate on: never by view, and never a view in both.
 
     Without a name the scene of median difficulty is the one to validate on: by the share of its views that localize,
-    then by name. Raises TrainingError when there is
-    no such scene or no other, when two scenes are the same place, or one is in a dataset that is kept for ``tests``.
+    then by name. Raises TrainingError when there is no such scene or no other, when two scenes are the same place, or
+    one is in a dataset that is kept for ``tests``.
     """
     names = [s.name for s in scenes]
     if len(names) < 2:

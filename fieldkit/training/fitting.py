@@ -66,7 +66,7 @@ def fit(
     """
     import torch
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(str(machine()["device"]))
     with _repeatable(rules.seed):
         network = make().to(device)
         optimizer = torch.optim.AdamW(network.parameters(), lr=rules.learning_rate, weight_decay=rules.weight_decay)
@@ -98,12 +98,20 @@ def _told(rules: TrainingRules, history: tuple[Epoch, ...], best: int) -> str:
     )
 
 
+def machine() -> dict[str, str | int]:
+    """Return on what torch computes here: sums in another order have other last bits, and training multiplies them."""
+    import torch
+
+    return {"device": "cuda" if torch.cuda.is_available() else "cpu", "threads": torch.get_num_threads()}
+
+
 @contextlib.contextmanager
 def _repeatable(seed: int) -> Iterator[None]:
     """Make torch repeat itself inside; its state outside stays as it is."""
     import torch
 
-    before = torch.are_deterministic_algorithms_enabled(), torch.backends.cudnn.benchmark
+    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    benchmark = torch.backends.cudnn.benchmark
     with torch.random.fork_rng():
         torch.use_deterministic_algorithms(True, warn_only=True)
         torch.backends.cudnn.benchmark = False
@@ -111,8 +119,8 @@ def _repeatable(seed: int) -> Iterator[None]:
         try:
             yield
         finally:
-            torch.use_deterministic_algorithms(before[0])
-            torch.backends.cudnn.benchmark = before[1]
+            torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+            torch.backends.cudnn.benchmark = benchmark
 
 
 def _train(

@@ -29,7 +29,7 @@ class TrainingRules:
     model: ModelName = "vpt"
     seed: int = 0
     epochs: int | None = None
-    patience: int = 8
+    patience: int = 3
     batch: int | None = None
     learning_rate: float = 1e-3
     weight_decay: float = 0.01
@@ -49,6 +49,10 @@ class TrainingRules:
         for name, value in counts.items():
             if value is not None and value < (2 if name == "batch" else 1):
                 raise TrainingError(f"{name} is {value}; expected a positive number", hint=f"choose another {name}")
+        if self.model == "mlp" and (self.cap, self.drawn) != (None, None):
+            raise TrainingError(
+                "the model mlp takes all landmarks; expected no cap", hint="leave --cap and --drawn out"
+            )
         if not 0 <= self.seed < 2**31:
             raise TrainingError(f"seed is {self.seed}; expected 0..{2**31 - 1}", hint="choose another seed")
         sizes = {"learning_rate": self.learning_rate, "weight_decay": self.weight_decay, "jitter": self.jitter}

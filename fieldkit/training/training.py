@@ -12,23 +12,24 @@ import numpy as np
 from fieldkit.errors import TrainingError
 from fieldkit.learned.checkpoint import About, Checkpoint, Reduction, write_checkpoint
 from fieldkit.learned.scoring import APPEARANCE_WIDTH
-from fieldkit.maps import known_appearances
+from fieldkit.maps import appearance_path, known_appearances
 from fieldkit.store import digest, library_versions
 from fieldkit.store.datasets import map_path, scene_path, shard_path
 from fieldkit.store.files import plain, refuse_existing
 from fieldkit.training.calibrating import Calibration, chosen_share, fit_calibration, reliability
 from fieldkit.training.card import SceneCount, Verdict, card_path, write_card
 from fieldkit.training.examples import Examples, Progress, SceneFolder, Split, find_scenes, read_examples, split_scenes
-from fieldkit.training.fitting import Fitted, Material, fit
+from fieldkit.training.fitting import Fitted, Material, fit, machine
 from fieldkit.training.inputs import HistogramInputs, Inputs, TokenInputs
 from fieldkit.training.reducing import fit_reduction
-from fieldkit.training.resuming import forget_state
+from fieldkit.training.resuming import forget_state, state_path
 from fieldkit.training.rules import APPEARANCE_OF, TrainingRules
 from fieldkit.views import TOKEN_WIDTH
 
 if TYPE_CHECKING:
     import torch
 
+SUFFIX = ".safetensors"
 _LIBRARIES = ("fieldkit", "numpy", "torch")
 
 
@@ -58,43 +59,29 @@ def train(
 ) -> TrainingReport:
     """Train a learned policy on dataset folders and write its checkpoint and its card.
 
-    One scene is kept to validate on, ``validate`` or the alphabetically last; ``tests`` are datasets whose scenes must
-    not be among them. The same data, rules and machine give the same bytes, and a killed training goes on where it was
-    when it is called again. Raises DatasetError, StoreError or MapError for data that cannot be used, TrainingError
-    for scenes, labels or an unfinished training that do not fit, and StoreError when ``out`` is in the way.
+    One scene is kept to validate on, ``validate`` or the one of median difficulty; ``tests`` are datasets whose scenes
+    must not be among them. The same data, rules, machine and number of torch's threads give the same bytes, and a
+    killed training goes on where it was when it is called again. Raises DatasetError, StoreError or MapError for data
+    that cannot be used, TrainingError for scenes, labels or an unfinished training that do not fit, and StoreError when
+    ``out`` is in the way.
     """
     rules, out = (rules or TrainingRules()).settled(), Path(out)
-    for path in (out, card_path(out)):
-        refuse_existing(path, force=force, kind="file")
+    _refuse_out(out, force=force)
     split = split_scenes(find_scenes(datasets), validate=validate, tests=tests)
     scenes = [read_examples(s, progress=progress) for s in (*split.training, split.validation)]
     _refuse_one_class(split, scenes)
     reduction = _reduction(scenes[:-1], split, rules)
     training, validation = (_inputs(part, rules, reduction, progress) for part in (scenes[:-1], scenes[-1:]))
     material = Material(training, validation, scenes[-1].waypoint)
-    data = _data_digest(split)
-    versions = {name: version for name, version in library_versions().items() if name in _LIBRARIES}
-    key = digest(data, repr(rules), repr(sorted(versions.items())))
+    data = _data_digest(split, APPEARANCE_OF.get(rules.model))
+    key = digest(data, repr(rules), repr(sorted(_versions().items())), repr(machine()))
     fitted = fit(lambda: _network(rules), material, rules=rules, out=out, key=key, force=force, progress=progress)
     calibration = fit_calibration(fitted.log_odds.ravel(), np.tile(scenes[-1].label, len(fitted.log_odds)))
-    about = About(
-        kind=rules.model,
-        feature=split.validation.rules.feature,
-        landmark_cap=rules.cap,
-        training_scenes=tuple(s.name for s in split.training),
-        validation_scenes=(split.validation.name,),
-        dataset_digest=data,
-        seed=rules.seed,
-        temperature=calibration.temperature,
-        bias=calibration.bias,
-        appearance=APPEARANCE_OF.get(rules.model),
-        training={"rules": plain(dataclasses.asdict(rules)), "epochs": len(fitted.history), "best": fitted.best + 1},
-        versions=versions,
-    )
+    about = _about(split, rules, fitted, calibration, data=data)
     verdicts = tuple(_verdict(scenes[-1], fitted, calibration, occlusion=use) for use in (True, False))
     counts = [_count(s, "training") for s in scenes[:-1]] + [_count(scenes[-1], "validation")]
-    write_card(out, about, rules=rules, scenes=counts, history=fitted.history, verdicts=verdicts)
     write_checkpoint(out, Checkpoint(about, fitted.weights, reduction))
+    write_card(out, about, rules=rules, scenes=counts, history=fitted.history, verdicts=verdicts)
     forget_state(out)
     return TrainingReport(
         path=out,
@@ -105,6 +92,37 @@ def train(
         best=fitted.best + 1,
         calibration=calibration,
         verdicts=verdicts,
+    )
+
+
+def _refuse_out(out: Path, *, force: bool) -> None:
+    """Raise where the files to write are there already, and no unfinished training has begun to write them."""
+    if out.suffix != SUFFIX:
+        raise TrainingError(f"{out}: expected a name that ends in {SUFFIX}", hint=f"give --out {out.stem}{SUFFIX}")
+    if not state_path(out).is_file():
+        for path in (out, card_path(out)):
+            refuse_existing(path, force=force, kind="file")
+
+
+def _versions() -> dict[str, str]:
+    return {name: version for name, version in library_versions().items() if name in _LIBRARIES}
+
+
+def _about(split: Split, rules: TrainingRules, fitted: Fitted, calibration: Calibration, *, data: str) -> About:
+    done = {"rules": plain(dataclasses.asdict(rules)), "epochs": len(fitted.history), "best": fitted.best + 1}
+    return About(
+        kind=rules.model,
+        feature=split.validation.rules.feature,
+        landmark_cap=rules.cap,
+        training_scenes=tuple(s.name for s in split.training),
+        validation_scenes=(split.validation.name,),
+        dataset_digest=data,
+        seed=rules.seed,
+        temperature=calibration.temperature,
+        bias=calibration.bias,
+        appearance=APPEARANCE_OF.get(rules.model),
+        training={**done, **machine()},
+        versions=_versions(),
     )
 
 
@@ -171,12 +189,13 @@ def _inputs(
     return TokenInputs(scenes, rules, appearance=reduced)
 
 
-def _data_digest(split: Split) -> str:
-    """Return the digest of all views, and of which scenes are trained on and which validates."""
+def _data_digest(split: Split, network: str | None) -> str:
+    """Return the digest of all views, of the appearance that is used, and of which scenes are trained on."""
 
     def told(scene: SceneFolder) -> str:
         shards = (shard_path(scene.folder, scene.name, w) for w in scene.entry.waypoints)
-        return digest(scene_path(scene.folder, scene.name), *shards)
+        seen = [] if network is None else [appearance_path(map_path(scene.folder, scene.entry), network)]
+        return digest(scene_path(scene.folder, scene.name), *shards, *seen)
 
     return digest(*(told(s) for s in split.training), "validation", told(split.validation))
 
