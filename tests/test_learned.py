@@ -220,6 +220,12 @@ def test_a_reduction_of_other_shapes_is_refused(tmp_path: Path) -> None:
     write_checkpoint(tmp_path / "odd", odd)
     with pytest.raises(WeightsError, match=r"reduction of appearance has the shapes .*'low': \(2,\)"):
         read_checkpoint(tmp_path / "odd")
+    narrow = dataclasses.replace(
+        made.reduction, mean=np.zeros(50, np.float32), components=np.zeros((3, 50), np.float32)
+    )
+    write_checkpoint(tmp_path / "odd", dataclasses.replace(made, reduction=narrow))
+    with pytest.raises(WeightsError, match=r"reduction of appearance has the shapes .*\(3, 50\).*\(3, 112\)"):
+        read_checkpoint(tmp_path / "odd")
     plain = Checkpoint(msgspec.structs.replace(seeded("vpt").about), seeded("vpt").weights, made.reduction)
     write_checkpoint(tmp_path / "odd", plain)
     with pytest.raises(WeightsError, match=r"expected finite .* it uses no appearance"):

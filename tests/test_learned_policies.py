@@ -20,7 +20,7 @@ from fieldkit.dataset import replay_datasets
 from fieldkit.errors import MapError, PolicyError, WeightsError
 from fieldkit.features.appearance import APPEARANCES
 from fieldkit.learned.checkpoint import write_checkpoint
-from fieldkit.maps import add_appearance, load_map
+from fieldkit.maps import add_appearance, compact_map, load_map
 from fieldkit.maps.appearance import appearance_path, write_appearance
 from fieldkit.policies import learned
 from fieldkit.protocol import OcclusionRules, Protocol, Threshold
@@ -259,6 +259,16 @@ def test_why_a_view_was_preferred_is_kept_and_drawn(scene_map: SceneMap, tmp_pat
         store.read_run(tmp_path / "run")
 
 
+def test_rows_in_scenes_that_a_policy_was_trained_on_are_no_test(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING)
+    known = seeded("mlp", training_scenes=("office", "shop"), validation_scenes=("lobby",))
+    policies.warn_known({"mlp": known}, ["clinic"])
+    assert not caplog.text
+    policies.warn_known({"mlp": known}, ["shop", "clinic", "lobby"])
+    assert "mlp was trained on shop: its rows there are no test" in caplog.text
+    assert "mlp was validated on lobby" in caplog.text
+
+
 def test_appearance_is_added_beside_a_map_and_belongs_to_it(whole: Path, tmp_path: Path) -> None:
     entry = read_scene(whole, read_dataset(whole).scenes[0])
     lab = Path(shutil.copytree(map_path(whole, entry), tmp_path / "lab.map"))
@@ -268,6 +278,8 @@ def test_appearance_is_added_beside_a_map_and_belongs_to_it(whole: Path, tmp_pat
     after = load_map(lab)
     assert after.digest == before.digest
     np.testing.assert_array_equal(after.appearance["efficientnet"], vectors)
+    compact_map(lab, tmp_path / "small.map")
+    np.testing.assert_array_equal(load_map(tmp_path / "small.map").appearance["efficientnet"], vectors)
     for bad, digest in ((vectors, "other"), (vectors[1:], before.digest), (vectors * np.nan, before.digest)):
         write_appearance(lab, "efficientnet", bad, digest=digest)
         with pytest.raises(MapError, match=r"appearance-efficientnet\.npz: .*; expected"):

@@ -17,7 +17,7 @@ from fieldkit.frames import Pose, exp
 from fieldkit.protocol import CandidateRules, OcclusionRules, Protocol, Threshold
 from fieldkit.surface import RayCaster
 from fieldkit.types import Candidates, SceneMap, Surface
-from fieldkit.views import landmark_heat_maps, landmark_statistics, visibility
+from fieldkit.views import HeatMaps, landmark_statistics, visibility
 
 CAMERA = Camera("PINHOLE", 640, 480, (552.03, 552.03, 320.0, 240.0))
 RULES = CandidateRules(max_distance_m=5.0)
@@ -135,24 +135,23 @@ def test_heat_maps_say_where_in_their_images_mapping_saw_a_landmark(scene_map: S
     seen = scene_map.observation_landmark == 7
     pixels[seen] = [(0.5, 0.5), (639.9, 479.9), (320.0, 100.0)]
     moved = dataclasses.replace(scene_map, observation_px=pixels)
-    heat = landmark_heat_maps(moved, np.array([7, 3, 7]))
+    heat = HeatMaps(moved).counts(np.array([7, 3, 7]))
     assert heat.shape == (3, 8, 8)
     expected = np.zeros((8, 8), np.float32)
-    expected[[0, 7, 1], [0, 7, 4]] = 1 / 3
+    expected[[0, 7, 1], [0, 7, 4]] = 1
     np.testing.assert_allclose(heat[0], expected)
     np.testing.assert_array_equal(heat[2], heat[0])
-    assert heat[1, 0, 0] == 1.0
-    np.testing.assert_allclose(heat.sum(axis=(1, 2)), 1.0)
-    assert landmark_heat_maps(moved, np.array([], np.int32)).shape == (0, 8, 8)
+    assert heat[1, 0, 0] == 3
+    assert (heat.sum(axis=(1, 2)) == 3).all()
+    assert HeatMaps(moved).counts(np.array([], np.int32)).shape == (0, 8, 8)
 
 
 def test_the_image_of_another_camera_has_cells_of_its_own_size(scene_map: SceneMap) -> None:
     portrait = Camera("PINHOLE", 480, 640, (552.03, 552.03, 240.0, 320.0))
     pixels = np.full((75, 2), 470.0, np.float32)
     turned = dataclasses.replace(scene_map, image_cameras=(CAMERA, CAMERA, portrait), observation_px=pixels)
-    heat = landmark_heat_maps(turned, np.array([0]))[0]
-    assert heat[7, 5] == pytest.approx(2 / 3)
-    assert heat[5, 7] == pytest.approx(1 / 3)
+    heat = HeatMaps(turned).counts(np.array([0]))[0]
+    assert (heat[7, 5], heat[5, 7]) == (2, 1)
 
 
 class CountingRays(RayCaster):

@@ -13,7 +13,7 @@ from fieldkit.views.features import (
     view_histograms,
 )
 from fieldkit.views.plan import PLAN_LANDMARKS, plan_view
-from fieldkit.views.statistics import HEAT_CELLS, HeatMaps, landmark_heat_maps, landmark_statistics
+from fieldkit.views.statistics import HEAT_CELLS, HeatMaps, landmark_statistics
 from fieldkit.views.visible import Visibility, visibility
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "SeenLandmarks",
     "Visibility",
     "forward_directions",
-    "landmark_heat_maps",
     "landmark_statistics",
     "landmark_tokens",
     "plan_view",

@@ -77,18 +77,6 @@ class HeatMaps:
         return counted.reshape(len(number), self._cells, self._cells)
 
 
-def landmark_heat_maps(
-    scene_map: SceneMap, landmarks: NDArray[np.integer], *, cells: int = HEAT_CELLS
-) -> NDArray[np.float32]:
-    """Return f32[k, cells, cells] for some landmarks (k): where in their images the mapping cameras saw each.
-
-    Rows go down the image and columns to the right; every map sums to 1. Of all landmarks of a large map they are many
-    gigabytes: ask for those that are needed.
-    """
-    counts = HeatMaps(scene_map, cells=cells).counts(landmarks)
-    return np.asarray(counts / np.maximum(counts.sum(axis=(1, 2), keepdims=True), 1), dtype=np.float32)
-
-
 def _extreme(ufunc: np.ufunc, landmark: NDArray[np.int32], values: Array, n: int) -> Array:
     result = np.full(n, np.inf if ufunc is np.minimum else -np.inf)
     ufunc.at(result, landmark, values)
