@@ -98,7 +98,7 @@ def comparison_table(run: Run, pairs: Sequence[Pair], thresholds: Sequence[Thres
             f"{c.threshold.position_m:g} m / {c.threshold.rotation_deg:g} deg",
             f"{100 * c.difference:+.1f}",
             f"{100 * c.interval[0]:+.1f} .. {100 * c.interval[1]:+.1f}",
-            f"{c.n_a_only:g} / {c.n_b_only:g}",
+            f"{c.n_a_only:.1f} / {c.n_b_only:.1f}",
             f"{c.p:.4f}",
             f"{c.p_corrected:.4f}",
             _verdict(c),
