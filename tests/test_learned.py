@@ -115,6 +115,8 @@ def test_temperature_and_bias_change_the_log_odds_only(views: list[np.ndarray]) 
     # Log-odds are rounded to five digits
     np.testing.assert_allclose(other.log_odds(views), plain / 2.0 - 0.5, atol=1.1e-5)
     np.testing.assert_allclose(other.scores(views), 1 / (1 + np.exp(-(plain / 2.0 - 0.5))), atol=1.1e-5)
+    unfiltered = Scorer(seeded("vpt", temperature_unfiltered=4.0, bias_unfiltered=1.0)).log_odds(views, filtered=False)
+    np.testing.assert_allclose(unfiltered, plain / 4.0 + 1.0, atol=1.1e-5)
 
 
 def test_scoring_leaves_the_threads_of_torch_as_they_are(views: list[np.ndarray]) -> None:
@@ -167,7 +169,7 @@ def rewritten(path: Path, *, about: dict[str, Any] | None = None, tensors: dict[
         ({"feature": None}, "missing required field `feature`"),
         ({"temperature": 0.0}, "Expected `float` > 0.0"),
         ({"landmark_cap": 0}, ">= 1"),
-        ({"bias": float("nan")}, "has the bias nan"),
+        ({"bias": float("nan")}, "has temperatures and biases 1, nan"),
         ({"normalisation": {"full_distance_m": 8.0}}, "features with full_angle_deg None; this version computes"),
         ({"appearance": "efficientnet"}, "is a vpt with the appearance 'efficientnet'; expected vpt_appearance"),
         ({"kind": "vpt_dino", "appearance": "efficientnet"}, "is a vpt_dino with the appearance 'efficientnet'"),

@@ -273,7 +273,7 @@ def test_a_policy_without_weights_says_so() -> None:
 def test_no_policy_is_given_images_estimates_or_truth() -> None:
     names = {f.name for f in dataclasses.fields(policies.Scene)} | {f.name for f in dataclasses.fields(Candidates)}
     assert names == {
-        "candidates", "visible", "statistics", "heat_maps",
+        "candidates", "visible", "statistics", "heat_maps", "filtered",
         "visit", "view_ids", "kinds", "map_from_cam", "camera", "allowed", "forward_in_map",
     }  # fmt: skip
 

@@ -141,7 +141,9 @@ def test_a_checkpoint_says_what_it_was_trained_on(views: Path, tmp_path: Path) -
     about = read_checkpoint(report.path).about
     assert (about.training_scenes, about.validation_scenes) == (("b", "c"), ("a",))
     assert (about.kind, about.feature, about.landmark_cap, about.seed) == ("vpt", "sift", 24, 0)
-    assert about.temperature == report.calibration.temperature
+    assert (about.temperature, about.temperature_unfiltered) == tuple(c.temperature for c in report.calibrations)
+    assert (about.bias, about.bias_unfiltered) == tuple(c.bias for c in report.calibrations)
+    assert about.bias != about.bias_unfiltered
     card = report.card.read_text()
     assert "| a | validation | 72 |" in card
     assert "Brier score" in card

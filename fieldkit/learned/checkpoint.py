@@ -29,8 +29,9 @@ class About(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ``feature``, ``training_scenes``, ``validation_scenes``, ``dataset_digest`` and ``seed``: what the weights were
     trained on, and with. ``landmark_cap``: how many landmarks of a view are scored at most (None: all).
     ``normalisation``: the constants of the features. The score is the probability of the log-odds
-    (second logit - first) / ``temperature`` + ``bias``. ``appearance`` names the network of appearance, ``training``
-    are settings and results of the training as plain values.
+    (second logit - first) / ``temperature`` + ``bias``, or of those named ``_unfiltered`` where
+    hidden landmarks are not left out: as many visible ones then say less. ``appearance`` names the network of
+    appearance, ``training`` are settings and results of the training as plain values.
     """
 
     version: Literal[1] = 1
@@ -43,6 +44,8 @@ class About(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     seed: int
     temperature: Annotated[float, msgspec.Meta(gt=0)] = 1.0
     bias: float = 0.0
+    temperature_unfiltered: Annotated[float, msgspec.Meta(gt=0)] = 1.0
+    bias_unfiltered: float = 0.0
     appearance: str | None = None
     normalisation: dict[str, float] = msgspec.field(default_factory=normalisation)
     training: dict[str, Any] = {}
@@ -133,9 +136,10 @@ def _about(header: str, path: Path) -> About:
         raise WeightsError(error.message, hint=error.hint) from error
     except (json.JSONDecodeError, RecursionError) as error:
         raise WeightsError(f"{path}: its header is damaged; expected {WHAT}", hint="copy the file again") from error
-    if not np.isfinite([about.bias, about.temperature]).all():
+    numbers = (about.temperature, about.bias, about.temperature_unfiltered, about.bias_unfiltered)
+    if not np.isfinite(numbers).all():
         raise WeightsError(
-            f"{path}: has the bias {about.bias:g} and the temperature {about.temperature:g}; expected finite numbers",
+            f"{path}: has temperatures and biases {', '.join(f'{n:g}' for n in numbers)}; expected finite numbers",
             hint="train again",
         )
     now = normalisation()

@@ -58,24 +58,30 @@ class Scorer:
         self._width = token_width(checkpoint)
         self._network = open_network(checkpoint)
 
-    def scores(self, views: Sequence[Floats], *, visible: Sequence[int] | None = None) -> Array:
+    def scores(self, views: Sequence[Floats], *, visible: Sequence[int] | None = None, filtered: bool = True) -> Array:
         """Return for each view the probability f64[v] that it localizes.
 
         ``views`` are histograms f32[146] for an MLP, else tokens f32[k, 73 or 76] of landmarks, k may be 0. ``visible``
-        is how many landmarks each view sees where its tokens are of some of them only.
+        is how many landmarks each view sees where its tokens are of some of them only; ``filtered`` whether those
+        behind the surface were left out.
         """
-        return 1.0 / (1.0 + np.exp(-self.log_odds(views, visible=visible)))
+        return 1.0 / (1.0 + np.exp(-self.log_odds(views, visible=visible, filtered=filtered)))
 
-    def log_odds(self, views: Sequence[Floats], *, visible: Sequence[int] | None = None) -> Array:
+    def log_odds(
+        self, views: Sequence[Floats], *, visible: Sequence[int] | None = None, filtered: bool = True
+    ) -> Array:
         """Return the logarithm f64[v] of each view's odds to localize; see `scores`."""
         import torch
 
         result = np.empty(len(views), dtype=np.float64)
         about = self.checkpoint.about
+        temperature, bias = about.temperature, about.bias
+        if not filtered:
+            temperature, bias = about.temperature_unfiltered, about.bias_unfiltered
         with torch.inference_mode():
             for members, inputs in self._batches(views, [len(v) for v in views] if visible is None else visible):
                 logits = self._network(*map(torch.from_numpy, inputs)).double()
-                result[members] = ((logits[:, 1] - logits[:, 0]) / about.temperature + about.bias).numpy()
+                result[members] = ((logits[:, 1] - logits[:, 0]) / temperature + bias).numpy()
         # The last bits depend on batches and threads: views that show the same tie
         return np.round(result, _DIGITS)
 

@@ -133,7 +133,9 @@ class Learned:
         seen = self._seen(scene)
         result = np.full(len(seen), -np.inf)
         features = [self._features(scene, seen[i]) for i in allowed]
-        result[allowed] = self.scorer.scores(features, visible=[seen[i].visible for i in allowed])
+        result[allowed] = self.scorer.scores(
+            features, visible=[seen[i].visible for i in allowed], filtered=scene.filtered
+        )
         return result
 
     def raised(self, scene: Scene, view: int) -> tuple[NDArray[np.int32], Floats]:
@@ -150,7 +152,7 @@ class Learned:
         else:
             without = [np.delete(everything, i, axis=0) for i in asked]
         visible = [seen.visible, *(len(asked) * [seen.visible - 1])]
-        log_odds = self.scorer.log_odds([everything, *without], visible=visible)
+        log_odds = self.scorer.log_odds([everything, *without], visible=visible, filtered=scene.filtered)
         return seen.landmark[asked], (log_odds[0] - log_odds[1:]).astype(np.float32)
 
     def _seen(self, scene: Scene) -> list[SeenLandmarks]:

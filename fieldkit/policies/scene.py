@@ -12,12 +12,16 @@ from fieldkit.views import HeatMaps, Visibility, visibility
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The input of every policy: v candidates, their visible landmarks, and how mapping saw all n landmarks."""
+    """The input of every policy: v candidates, their visible landmarks, and how mapping saw all n landmarks.
+
+    ``filtered`` tells whether landmarks behind the surface were left out.
+    """
 
     candidates: Candidates
     visible: Visibility
     statistics: LandmarkStatistics
     heat_maps: HeatMaps
+    filtered: bool
 
 
 def look_at(
@@ -35,4 +39,4 @@ def look_at(
     ``heat_maps`` of the map, where they were made already, spare making them again.
     """
     seen = visibility(scene_map, candidates, rules=rules, rays=rays, tolerance_m=tolerance_m)
-    return Scene(candidates, seen, statistics, heat_maps or HeatMaps(scene_map))
+    return Scene(candidates, seen, statistics, heat_maps or HeatMaps(scene_map), rays is not None)

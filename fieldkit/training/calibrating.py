@@ -22,9 +22,13 @@ class Calibration:
     temperature: float
     bias: float
 
+    def log_odds(self, log_odds: Array) -> Array:
+        """Return calibrated log-odds f64[v]."""
+        return log_odds / self.temperature + self.bias
+
     def apply(self, log_odds: Array) -> Array:
         """Return probabilities f64[v]."""
-        return probability(log_odds / self.temperature + self.bias)
+        return probability(self.log_odds(log_odds))
 
 
 def probability(log_odds: Array) -> Array:

@@ -200,11 +200,10 @@ def _judged(odds: Array, material: Material) -> tuple[float, float]:
     The loss tells epochs apart better than the choices at a scene's hundred waypoints, which chance decides.
     """
     label = material.validation.label
-    every = np.tile(label, len(odds))
-    calibrated = fit_calibration(odds.ravel(), every)
+    calibrated = [fit_calibration(row, label).log_odds(row) for row in odds]
     half = max(int(np.bincount(material.waypoint).max()) // 2, 1)
     chosen = float(np.mean([chosen_share(row, label, material.waypoint, of=half) for row in odds]))
-    return log_loss(odds.ravel() / calibrated.temperature + calibrated.bias, every), chosen
+    return float(np.mean([log_loss(row, label) for row in calibrated])), chosen
 
 
 def _tensor(values: NDArray[Any]) -> torch.Tensor:

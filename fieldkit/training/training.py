@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fieldkit.errors import TrainingError
 from fieldkit.learned.checkpoint import About, Checkpoint, Reduction, write_checkpoint
@@ -29,6 +30,7 @@ from fieldkit.views import TOKEN_WIDTH
 if TYPE_CHECKING:
     import torch
 
+Array = NDArray[np.float64]
 SUFFIX = ".safetensors"
 _LIBRARIES = ("fieldkit", "numpy", "torch")
 
@@ -43,7 +45,7 @@ class TrainingReport:
     validation: str
     epochs: int
     best: int
-    calibration: Calibration
+    calibrations: tuple[Calibration, Calibration]
     verdicts: tuple[Verdict, ...]
 
 
@@ -76,9 +78,12 @@ def train(
     data = _data_digest(split, APPEARANCE_OF.get(rules.model))
     key = digest(data, repr(rules), repr(sorted(_versions().items())), repr(machine()))
     fitted = fit(lambda: _network(rules), material, rules=rules, out=out, key=key, force=force, progress=progress)
-    calibration = fit_calibration(fitted.log_odds.ravel(), np.tile(scenes[-1].label, len(fitted.log_odds)))
-    about = _about(split, rules, fitted, calibration, data=data)
-    verdicts = tuple(_verdict(scenes[-1], fitted, calibration, occlusion=use) for use in (True, False))
+    filtered, unfiltered = (fit_calibration(odds, scenes[-1].label) for odds in fitted.log_odds)
+    about = _about(split, rules, fitted, (filtered, unfiltered), data=data)
+    verdicts = (
+        _verdict(scenes[-1], fitted.log_odds[0], filtered, occlusion=True),
+        _verdict(scenes[-1], fitted.log_odds[1], unfiltered, occlusion=False),
+    )
     counts = [_count(s, "training") for s in scenes[:-1]] + [_count(scenes[-1], "validation")]
     write_checkpoint(out, Checkpoint(about, fitted.weights, reduction))
     write_card(out, about, rules=rules, scenes=counts, history=fitted.history, verdicts=verdicts)
@@ -90,7 +95,7 @@ def train(
         validation=split.validation.name,
         epochs=len(fitted.history),
         best=fitted.best + 1,
-        calibration=calibration,
+        calibrations=(filtered, unfiltered),
         verdicts=verdicts,
     )
 
@@ -108,7 +113,10 @@ def _versions() -> dict[str, str]:
     return {name: version for name, version in library_versions().items() if name in _LIBRARIES}
 
 
-def _about(split: Split, rules: TrainingRules, fitted: Fitted, calibration: Calibration, *, data: str) -> About:
+def _about(
+    split: Split, rules: TrainingRules, fitted: Fitted, calibrations: tuple[Calibration, Calibration], *, data: str
+) -> About:
+    filtered, unfiltered = calibrations
     done = {"rules": plain(dataclasses.asdict(rules)), "epochs": len(fitted.history), "best": fitted.best + 1}
     return About(
         kind=rules.model,
@@ -118,8 +126,10 @@ def _about(split: Split, rules: TrainingRules, fitted: Fitted, calibration: Cali
         validation_scenes=(split.validation.name,),
         dataset_digest=data,
         seed=rules.seed,
-        temperature=calibration.temperature,
-        bias=calibration.bias,
+        temperature=filtered.temperature,
+        bias=filtered.bias,
+        temperature_unfiltered=unfiltered.temperature,
+        bias_unfiltered=unfiltered.bias,
         appearance=APPEARANCE_OF.get(rules.model),
         training={**done, **machine()},
         versions=_versions(),
@@ -204,8 +214,7 @@ def _count(scene: Examples, use: str) -> SceneCount:
     return SceneCount(scene.scene, use, len(scene.label), float(np.mean(scene.label)))
 
 
-def _verdict(scene: Examples, fitted: Fitted, calibration: Calibration, *, occlusion: bool) -> Verdict:
-    odds = fitted.log_odds[0 if occlusion else 1]
+def _verdict(scene: Examples, odds: Array, calibration: Calibration, *, occlusion: bool) -> Verdict:
     visible = np.array([len(scene.view(i, occlusion=occlusion).landmark) for i in range(len(scene.label))], dtype=float)
     return Verdict(
         occlusion=occlusion,
