@@ -86,8 +86,15 @@ class FeatureKind:
 
 
 def _aliked(variant: aliked.AlikedVariant, *, lightglue: str | None = None) -> FeatureKind:
-    load, names = functools.partial(aliked.load_aliked, variant), (lightglue, variant.weights)
-    return FeatureKind(load, variant.width, "mutual", "float32", True, 0.6, *names)
+    return FeatureKind(
+        functools.partial(aliked.load_aliked, variant),
+        variant.width,
+        "mutual",
+        colour=True,
+        min_cosine=0.6,
+        lightglue=lightglue,
+        weights=variant.weights,
+    )
 
 
 # Least similarities: ALIKED's by eight pairs of red kitchen frames (19 of 20 right matches pass, a third of the wrong
