@@ -44,7 +44,7 @@ def train(
         test: dataset of test scenes: none of them may be trained or validated on; may be repeated
         seed: seed of weights, order and variations
         epochs: how often the training views are gone over at most
-        patience: epochs without a smaller loss in the validation scene that end it early
+        patience: epochs without a smaller loss in the validation scene that end it early; 0 keeps the last epoch
         cap: landmarks of a view that are looked at, at most; by default 256
         drawn: landmarks of a view that it learns from at a time, at most; by default 64
         json: print JSON

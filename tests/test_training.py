@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -100,14 +101,28 @@ def test_a_trained_network_chooses_views_that_localize_in_a_scene_it_never_saw(v
     assert np.mean((scores - scene.label) ** 2) == pytest.approx(filtered.reliability.brier, abs=1e-5)
 
 
-def test_a_training_that_gains_nothing_ends_early(own: Path, tmp_path: Path, rng: np.random.Generator) -> None:
+@pytest.fixture
+def nothing_to_learn(own: Path, rng: np.random.Generator) -> Path:
+    """A dataset whose validation scene c has labels by chance."""
     for path in sorted((own / "c").glob("*.npz")):
         shard = read_shard(path)
         write_shard(path, dataclasses.replace(shard, label=rng.random(len(shard.label)) < 0.5))
+    return own
+
+
+def test_a_training_that_gains_nothing_ends_early(nothing_to_learn: Path, tmp_path: Path) -> None:
     rules = TrainingRules("mlp", epochs=40, patience=2, batch=24, learning_rate=3e-3)
-    report = train([own], tmp_path / "x.safetensors", rules=rules, validate="c")
+    report = train([nothing_to_learn], tmp_path / "x.safetensors", rules=rules, validate="c")
     assert report.epochs == report.best + rules.patience
     assert report.epochs < 40
+
+
+def test_without_patience_the_validation_scene_chooses_no_epoch(nothing_to_learn: Path, tmp_path: Path) -> None:
+    rules = TrainingRules("mlp", epochs=8, patience=0, batch=24, learning_rate=3e-3)
+    report = train([nothing_to_learn], tmp_path / "x.safetensors", rules=rules, validate="c")
+    rows = [line.split("|") for line in report.card.read_text().splitlines() if re.match(r"\| \d+ \|", line)]
+    assert report.epochs == report.best == len(rows) == 8
+    assert float(rows[-1][3]) > min(float(row[3]) for row in rows)
 
 
 def test_without_a_name_the_scene_of_median_difficulty_validates(own: Path) -> None:

@@ -87,6 +87,9 @@ def _data(scenes: Sequence[SceneCount]) -> str:
 
 def _settings(rules: TrainingRules, history: Sequence[Epoch]) -> str:
     settings = ", ".join(f"{f.name} {getattr(rules, f.name)}" for f in dataclasses.fields(rules))
+    kept = (
+        "the epoch with the least validation loss" if rules.patience else "the last epoch, whatever the validation loss"
+    )
     rows = [
         f"| {i} | {e.loss:.4f} | {e.validation_loss:.4f} | {100 * e.chosen:.2f} |" for i, e in enumerate(history, 1)
     ]
@@ -94,7 +97,7 @@ def _settings(rules: TrainingRules, history: Sequence[Epoch]) -> str:
         [
             "## Training",
             "",
-            f"Settings: {settings}. Classes weigh the same. Kept: the epoch with the least validation loss",
+            f"Settings: {settings}. Classes weigh the same. Kept: {kept}",
             "(calibrated, with and without the occlusion filter). Chosen well: the best of half of a waypoint's",
             "candidates localizes.",
             "",

@@ -62,7 +62,8 @@ def fit(
     """Fit a network; after every epoch its state is kept beside ``out``, from which the same call goes on.
 
     With ``force`` the state of another training there is replaced, else it raises TrainingError.
-    Classes weigh the same, whatever their numbers. The epoch with the least loss in the validation scene is kept.
+    Classes weigh the same, whatever their numbers. The epoch with the least loss in the validation scene is kept,
+    and without patience the last one, so that this scene chooses nothing.
     """
     import torch
 
@@ -75,12 +76,13 @@ def fit(
             _restore(network, optimizer, state)
         history, best, kept = ((), 0, None) if state is None else (state.history, state.best, dict(state.kept))
         assert rules.epochs is not None
-        while len(history) < rules.epochs and len(history) - best <= rules.patience:
+        waits = rules.patience or rules.epochs
+        while len(history) < rules.epochs and len(history) - best <= waits:
             loss = _train(network, optimizer, material.training, rules=rules, epoch=len(history), progress=progress)
             odds = _log_odds(network, material.validation)
             now = Epoch(loss, *_judged(odds, material))
             history = (*history, now)
-            if kept is None or now.validation_loss < history[best].validation_loss:
+            if kept is None or not rules.patience or now.validation_loss < history[best].validation_loss:
                 best, kept = len(history) - 1, _arrays(network.state_dict())
             write_state(out, State(_arrays(network.state_dict()), _moments(optimizer), kept, best, history), key=key)
             if progress is not None:
@@ -94,7 +96,7 @@ def _told(rules: TrainingRules, history: tuple[Epoch, ...], best: int) -> str:
     now = history[-1]
     return (
         f"train {rules.model} | loss {now.loss:.3f}, validation loss {now.validation_loss:.3f}, chosen well "
-        f"{100 * now.chosen:.1f} % (least loss {history[best].validation_loss:.3f} after epoch {best + 1})"
+        f"{100 * now.chosen:.1f} % (kept: epoch {best + 1}, {history[best].validation_loss:.3f})"
     )
 
 

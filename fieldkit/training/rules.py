@@ -18,12 +18,12 @@ class TrainingRules:
     """Settings of a training; those that the defaults leave open depend on the model (`settled`).
 
     ``epochs`` passes over the training views at most, and ``patience`` of them without a smaller loss in the
-    validation scene end it early. Every step takes ``batch`` views; the learning rate rises to ``learning_rate``
-    and falls as a cosine. ``occluded`` is the share of the views that are shown without the landmarks behind the
-    surface, the others with all: one network serves both. ``cap``: landmarks of a view that are looked at, at most;
-    ``drawn``: of how many it learns at most, others each time, which is cheaper and keeps it from learning by heart.
-    ``jitter`` scales the noise that is put on landmarks, see `fieldkit.training.inputs`. Raises TrainingError where a
-    value cannot be used.
+    validation scene end it early; with 0 all are done and the last one is kept. Every step takes ``batch`` views; the
+    learning rate rises to ``learning_rate`` and falls as a cosine. ``occluded`` is the share of the views that are
+    shown without the landmarks behind the surface, the others with all: one network serves both. ``cap``: landmarks
+    of a view that are looked at, at most; ``drawn``: of how many it learns at most, others each time, which is cheaper
+    and keeps it from learning by heart. ``jitter`` scales the noise that is put on landmarks, see
+    `fieldkit.training.inputs`. Raises TrainingError where a value cannot be used.
     """
 
     model: ModelName = "vpt"
@@ -41,7 +41,6 @@ class TrainingRules:
     def __post_init__(self) -> None:
         counts = {
             "epochs": self.epochs,
-            "patience": self.patience,
             "batch": self.batch,
             "cap": self.cap,
             "drawn": self.drawn,
@@ -49,6 +48,8 @@ class TrainingRules:
         for name, value in counts.items():
             if value is not None and value < (2 if name == "batch" else 1):
                 raise TrainingError(f"{name} is {value}; expected a positive number", hint=f"choose another {name}")
+        if self.patience < 0:
+            raise TrainingError(f"patience is {self.patience}; expected 0 or more", hint="choose another patience")
         if self.model == "mlp" and (self.cap, self.drawn) != (None, None):
             raise TrainingError(
                 "the model mlp takes all landmarks; expected no cap", hint="leave --cap and --drawn out"
