@@ -20,7 +20,7 @@ install: .venv/installed
 demo: install
 	rm -rf $(DEMO)
 	$(BIN)/sim-bridge synthesize --scene $(SCENE) --seed $(SEED) --format mcap --out $(DEMO)/session
-	$(BIN)/fieldkit map build $(DEMO)/session/mapping --out $(DEMO)/lab.map
+	$(BIN)/fieldkit map build $(DEMO)/session/mapping --appearance efficientnet --out $(DEMO)/lab.map
 	$(BIN)/fieldkit tags calibrate $(DEMO)/session/photos --map $(DEMO)/lab.map --size-m 0.1365 --out $(DEMO)/tags.toml
 	$(BIN)/fieldkit replay $(DEMO)/session --map $(DEMO)/lab.map --tags $(DEMO)/tags.toml --protocol paper_real --out $(DEMO)/run
 	$(BIN)/fieldkit report $(DEMO)/run --out $(DEMO)/report.html
@@ -66,7 +66,7 @@ redkitchen: install
 	@test -n "$(DATA)" || { echo 'give the folder with frames/ and poses/: make redkitchen DATA=...' >&2; exit 1; }
 	rm -rf $(KITCHEN)
 	$(BIN)/python docs/examples/redkitchen.py $(DATA) --out $(KITCHEN)/input
-	$(BIN)/fieldkit map build $(KITCHEN)/input/source --scale slam --out $(KITCHEN)/lab.map
+	$(BIN)/fieldkit map build $(KITCHEN)/input/source --scale slam --appearance efficientnet --out $(KITCHEN)/lab.map
 	$(BIN)/fieldkit replay $(KITCHEN)/input/recording.mcap --map $(KITCHEN)/lab.map --protocol redkitchen --out $(KITCHEN)/run
 	$(BIN)/fieldkit report $(KITCHEN)/run --out $(KITCHEN)/report.html
 
@@ -74,7 +74,7 @@ redkitchen: install
 # are compared were the best of the validation scenes.
 TABLE := build/table-sim
 TEST_SCENES := library clinic school museum
-LEARNED ?= vpt
+LEARNED ?= vpt_appearance
 HEURISTICS ?= max angle
 table-sim: install
 	$(BIN)/sim-bridge dataset --scenes $(TEST_SCENES) --repeats 1 --appearance efficientnet --out $(TABLE)/sift
