@@ -21,7 +21,7 @@ from tiny_source import RULES, SOURCE, TinySource, content, make
 from fieldkit import maps, protocol, scores, store
 from fieldkit.cli import main
 from fieldkit.dataset import add_appearances, count_scenes, make_dataset, replay_datasets
-from fieldkit.errors import DatasetError, FieldkitError, StoreError
+from fieldkit.errors import DatasetError, FieldkitError, StoreError, WeightsError
 from fieldkit.frames import pose_error
 from fieldkit.report import write_report
 from fieldkit.store.datasets import Shard, read_dataset, read_gauge, read_scene, read_shard, row_pose, shard_path
@@ -49,6 +49,16 @@ def test_two_workers_give_the_same_bytes_as_one_and_a_map_made_twice_is_the_same
     make(tmp_path / "set", workers=2)
     assert content(tmp_path / "set") == content(whole)
     assert {p.name for p in whole.iterdir()} == {"dataset.toml", "maps", "tiny"}
+
+
+def test_missing_weights_of_the_feature_are_told_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FIELDKIT_WEIGHTS", str(tmp_path / "absent"))
+    rules = msgspec.structs.replace(RULES, feature="aliked")
+    with pytest.raises(WeightsError, match="absent: no such folder"):
+        make_dataset([SOURCE], tmp_path / "set", described={}, rules=rules)
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_killed_run_goes_on_to_the_same_bytes_and_leaves_no_process(whole: Path, mapped: Path) -> None:

@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from fieldkit import scores
 from fieldkit.dataset import SourceWaypoint
 from fieldkit.dataset.worker import views_key
+from fieldkit.errors import WeightsError
+from fieldkit.features import open_extractor
 from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer, Query
 from fieldkit.maps import load_map
@@ -39,6 +41,8 @@ Labels = NDArray[np.bool_]
 Pair = tuple[scores.Variant, scores.Variant]
 MARGIN = 0.03
 JUDGED = (0.1, 1.0)
+# The paper's second table is of these keypoints.
+PAPER_FEATURE = "superpoint"
 
 
 def repeatable(dataset: Path) -> float:
@@ -84,9 +88,20 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def recall_table(run: Run) -> str:
     """Return recall with its interval per policy, and what could not be run."""
     found = scores.table(run)
-    lines = [markdown(found.header, found.rows), "", found.caption]
+    lines = [markdown(found.header, found.rows), found.caption]
     lines += [f"Not run: {e.what}: {e.reason}" for e in run.excluded]
-    return "\n".join(lines)
+    if run.protocol.feature != PAPER_FEATURE:
+        lines.append(f"Not run: {PAPER_FEATURE}: {_why_not(PAPER_FEATURE)}")
+    return "\n\n".join(lines)
+
+
+def _why_not(feature: str) -> str:
+    """Say why there is no table of a feature: its weights are not to be had, or nobody made the dataset."""
+    try:
+        open_extractor(feature)
+    except WeightsError as error:
+        return error.message
+    return f"its weights are here, the dataset is not; make it with sim-bridge dataset --feature {feature}"
 
 
 def comparison_table(run: Run, pairs: Sequence[Pair], thresholds: Sequence[Threshold]) -> str:

@@ -22,7 +22,8 @@ from fieldkit.dataset import worker
 from fieldkit.dataset.folder import WORK_FOLDER, enter, own, settle, tidy
 from fieldkit.dataset.source import ViewSource
 from fieldkit.errors import DatasetError
-from fieldkit.features import feature_name
+from fieldkit.features import feature_kind, feature_name
+from fieldkit.features.weights import WEIGHTS, find_weights
 from fieldkit.store import library_versions
 from fieldkit.store.datasets import MAPS_FOLDER, DatasetFile, DatasetRules, scene_path
 from fieldkit.store.files import plain
@@ -84,7 +85,8 @@ def make_dataset(
     are the options of the sources as plain values: they are stored, and have to agree with those of an existing
     folder. ``force`` makes the shards of these ``sources`` again that were made otherwise and keeps the maps that still
     fit; other scenes of the folder stay, or the settings have to be theirs. Raises DatasetError or StoreError where
-    the folder cannot be used, or a scene cannot be read or mapped, and FeatureError for an unknown feature.
+    the folder cannot be used, or a scene cannot be read or mapped, FeatureError for an unknown feature, and
+    WeightsError, before any work, when the weights of a network's feature are not found.
     """
     rules, out = rules or DatasetRules(), Path(out)
     rules = msgspec.structs.replace(rules, feature=feature_name(rules.feature))
@@ -96,6 +98,9 @@ def make_dataset(
             raise DatasetError(f"scene {name!r}: cannot name a folder of the dataset", hint="give it another name")
     if workers < 1:
         raise DatasetError(f"{workers} workers; expected at least 1", hint="choose another number")
+    needed = feature_kind(rules.feature).weights
+    if needed is not None:
+        find_weights(WEIGHTS[needed])
     with own(out):
         head = DatasetFile(1, tuple(names), rules, plain(dict(described)), library_versions())
         plan = settle(out, head, force=force)
