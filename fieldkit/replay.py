@@ -110,6 +110,7 @@ def replay(
         map_seconds=maps.map_info(map_path).get("seconds", {}),
         excluded=(*excluded, *run.excluded),
         weights=look.weights,
+        trained_on=look.trained_on,
     )
     if not run.trials:
         reasons = "; ".join(f"{e.what}: {e.reason}" for e in run.excluded[:3]) or "there is no visit"

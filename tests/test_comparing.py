@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy import stats
 
 from fieldkit.errors import ScoreError
 from fieldkit.protocol import Threshold
-from fieldkit.scores import Comparison, compare, holm, learned_pairs
+from fieldkit.scores import Comparison, compare, holm, learned_pairs, verdict
 from fieldkit.types import Trial
 
 BOUND = Threshold(0.1, 1.0)
@@ -102,3 +103,47 @@ def test_what_is_not_there_is_not_compared() -> None:
     rows = trials("vpt", np.ones(2))
     with pytest.raises(ScoreError, match=r"no row fim without occlusion; expected it"):
         compare(rows, [(("vpt", True), ("fim", False))], thresholds=[BOUND], pose="cam")
+
+
+@pytest.mark.parametrize(("sessions", "visits"), [(12, 1), (6, 2), (13, 1)])
+def test_short_sessions_leave_the_interval_its_width(sessions: int, visits: int) -> None:
+    rng = np.random.default_rng(3)
+    covered = 0
+    for seed in range(200):
+        hits = rng.integers(0, 2, (2, sessions * visits)).astype(float)
+        rows = trials("vpt", hits[0], sessions=sessions) + trials("max", hits[1], sessions=sessions)
+        pair = (("vpt", True), ("max", True))
+        (found,) = compare(rows, [pair], thresholds=[BOUND], pose="cam", seed=seed, resamples=500)
+        covered += found.interval[0] <= 0.0 <= found.interval[1]
+    assert covered / 200 >= 0.9
+
+
+def test_one_visit_says_nothing() -> None:
+    rows = trials("vpt", np.ones(1)) + trials("max", np.zeros(1))
+    (found,) = compare(rows, [(("vpt", True), ("max", True))], thresholds=[BOUND], pose="cam")
+    assert (found.difference, found.interval) == (1.0, (-1.0, 1.0))
+
+
+def test_a_comparison_does_not_depend_on_what_else_is_compared() -> None:
+    rng = np.random.default_rng(0)
+    names = ("vpt", "max", "angle")
+    rows = [t for name in names for t in trials(name, rng.integers(0, 2, 50).astype(float))]
+    alone, among = (("vpt", True), ("max", True)), [(("vpt", True), (name, True)) for name in ("angle", "max")]
+    (one,) = compare(rows, [alone], thresholds=[BOUND], pose="cam")
+    many = compare(rows, among, thresholds=[Threshold(1.0, 5.0), BOUND], pose="cam")
+    (same,) = [c for c in many if c.b == ("max", True) and c.threshold == BOUND]
+    assert (one.interval, one.p) == (same.interval, same.p)
+
+
+def test_a_verdict_holds_p_and_interval_against_the_margin() -> None:
+    base = versus(np.ones(9), np.ones(9))
+
+    def said(difference: float, interval: tuple[float, float], p: float) -> str:
+        found = dataclasses.replace(base, difference=difference, interval=interval, p_corrected=p)
+        return verdict(found, margin=0.03)
+
+    assert said(0.05, (0.01, 0.09), 0.01) == "better"
+    assert said(0.05, (0.01, 0.09), 0.2) == "not worse by 3 points"
+    assert said(-0.15, (-0.18, -0.11), 0.001) == "worse"
+    assert said(-0.02, (-0.029, -0.01), 0.01) == "worse, by less than 3 points"
+    assert said(0.01, (-0.04, 0.06), 0.7) == "open"

@@ -119,6 +119,13 @@ def test_temperature_and_bias_change_the_log_odds_only(views: list[np.ndarray]) 
     np.testing.assert_allclose(unfiltered, plain / 4.0 + 1.0, atol=1.1e-5)
 
 
+def test_scores_that_are_no_numbers_are_refused(views: list[np.ndarray]) -> None:
+    found = seeded("vpt")
+    huge = {k: v * np.float32(1e20) if v.dtype == np.float32 else v for k, v in found.weights.items()}
+    with pytest.raises(WeightsError, match="gives scores that are not finite"):
+        Scorer(dataclasses.replace(found, weights=huge)).scores(views)
+
+
 def test_scoring_leaves_the_threads_of_torch_as_they_are(views: list[np.ndarray]) -> None:
     before = torch.get_num_threads(), torch.is_grad_enabled()
     Scorer(seeded("vpt")).scores(views)

@@ -19,7 +19,7 @@ from fieldkit import policies, protocol, scores, store
 from fieldkit.dataset import replay_datasets
 from fieldkit.errors import MapError, PolicyError, WeightsError
 from fieldkit.features.appearance import APPEARANCES
-from fieldkit.learned.checkpoint import write_checkpoint
+from fieldkit.learned.checkpoint import visibility_of, write_checkpoint
 from fieldkit.maps import add_appearance, compact_map, load_map
 from fieldkit.maps.appearance import appearance_path, write_appearance
 from fieldkit.policies import learned
@@ -160,13 +160,13 @@ def test_weights_that_are_not_meant_are_refused(tmp_path: Path, nothing_shipped:
         policies.find_checkpoints(("mlp",))
 
 
-@pytest.mark.parametrize("kind", ["mlp", "vpt", "vpt_appearance"])
+@pytest.mark.parametrize(("kind", "cap"), [("mlp", None), ("vpt", 64), ("vpt", 16), ("vpt_appearance", 64)])
 def test_the_landmarks_that_raised_a_score_most_carry_it(
-    kind: str, scene_map: SceneMap, candidates: Candidates
+    kind: str, cap: int | None, scene_map: SceneMap, candidates: Candidates
 ) -> None:
-    known = with_appearance(scene_map)
-    policy = policies.open_learned(seeded(kind), known)
-    looker = policies.Looker(known, RULES, checkpoints={kind: seeded(kind)})
+    known, checkpoint = with_appearance(scene_map), seeded(kind, landmark_cap=cap)
+    policy = policies.open_learned(checkpoint, known)
+    looker = policies.Looker(known, RULES, checkpoints={kind: checkpoint})
     scene = looker._scene(candidates, occlusion=False)
 
     def log_odds(without: np.ndarray) -> float:
@@ -181,6 +181,7 @@ def test_the_landmarks_that_raised_a_score_most_carry_it(
 
     landmarks, raised = policy.raised(scene, 0)
     assert set(landmarks) <= set(scene.visible.landmarks[0])
+    assert len(landmarks) == min(cap or 512, len(scene.visible.landmarks[0])) > 10
     everything = log_odds(np.zeros(0, int))
     order = np.argsort(raised)
     assert everything - log_odds(landmarks[order[-1:]]) == pytest.approx(float(raised.max()), abs=2e-5)
@@ -267,6 +268,30 @@ def test_rows_in_scenes_that_a_policy_was_trained_on_are_no_test(caplog: pytest.
     policies.warn_known({"mlp": known}, ["shop", "clinic", "lobby"])
     assert "mlp was trained on shop: its rows there are no test" in caplog.text
     assert "mlp was validated on lobby" in caplog.text
+
+
+def test_a_run_keeps_on_which_scenes_its_policies_were_trained(whole: Path, tmp_path: Path) -> None:
+    weights = write_seeded(tmp_path / "w", "mlp", training_scenes=("tiny", "office"))
+    run = replay_datasets([whole], protocol=RULES, out=tmp_path / "run", policy_weights=weights)
+    again = store.read_run(tmp_path / "run")
+    assert again.trained_on == run.trained_on == {"mlp": ("tiny", "office", "shop")}
+    assert scores.in_sample(again) == {"mlp": ("tiny",)}
+    assert "No test: mlp was trained or validated on tiny." in scores.table(again).caption
+    assert scores.score_dict(again)["in_sample"] == {"mlp": ["tiny"]}
+    elsewhere = dataclasses.replace(again, trained_on={"mlp": ("office",)})
+    assert "No test" not in scores.table(elsewhere).caption
+
+
+def test_a_protocol_that_sees_farther_than_training_is_told(
+    scene_map: SceneMap, caplog: pytest.LogCaptureFixture
+) -> None:
+    near = visibility_of(RULES.candidates, tolerance_voxels=RULES.occlusion.tolerance_voxels)
+    far = msgspec.structs.replace(RULES, candidates=msgspec.structs.replace(RULES.candidates, max_distance_m=8.0))
+    for rules in (RULES, far):
+        policies.Looker(scene_map, rules, checkpoints={"mlp": seeded("mlp", visibility=near)})
+    assert [r.message for r in caplog.records] == [
+        "mlp was trained with candidates.max_distance_m = 5, the protocol p has 8: scores may be less sure here"
+    ]
 
 
 def test_appearance_is_added_beside_a_map_and_belongs_to_it(whole: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fieldkit import scores
 from fieldkit.dataset import SourceWaypoint
 from fieldkit.dataset.worker import views_key
-from fieldkit.errors import WeightsError
+from fieldkit.errors import FieldkitError, WeightsError
 from fieldkit.features import open_extractor
 from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer, Query
@@ -32,7 +32,7 @@ from fieldkit.report.figures import curve_svg
 from fieldkit.store import read_run
 from fieldkit.store.datasets import DatasetRules, Shard, map_path, read_dataset, read_scene, read_scene_shard, row_pose
 from fieldkit.training import reliability
-from fieldkit.types import Run
+from fieldkit.types import Run, Trial
 from sim_bridge.dataset import SceneOptions, SceneSource
 from sim_bridge.stage.lookouts import LookoutOptions
 
@@ -45,12 +45,12 @@ JUDGED = (0.1, 1.0)
 PAPER_FEATURE = "superpoint"
 
 
-def repeatable(dataset: Path) -> float:
-    """Return the share of waypoints with a candidate that succeeds a second time, too, with new noise.
+def repeatable(dataset: Path, run: Run) -> Labels:
+    """Return for every visit of a run whether a candidate succeeds a second time, too, with new noise.
 
     The candidates that succeeded are drawn and localized again, nearest first, until one of them succeeds again.
     """
-    head, found = read_dataset(dataset), []
+    head, found = read_dataset(dataset), {}
     for name in head.scenes:
         entry = read_scene(dataset, name)
         shards = [read_scene_shard(dataset, entry, w) for w in entry.waypoints]
@@ -63,8 +63,9 @@ def repeatable(dataset: Path) -> float:
             sys.exit(f"{dataset}: {name} was not made with the standard sensors and changes; expected these")
         localizer = Localizer(load_map(map_path(dataset, entry)), head.rules.localizer, seed=head.rules.seed)
         waypoints = {w.id: w for w in source.waypoints()}
-        found += [_succeeds_again(s, source, waypoints[s.waypoint], localizer, head.rules) for s in shards]
-    return sum(found) / len(found)
+        for s in shards:
+            found[name, s.waypoint] = _succeeds_again(s, source, waypoints[s.waypoint], localizer, head.rules)
+    return np.array([found[p.session, p.prior.visit] for p in run.plans])
 
 
 def _succeeds_again(
@@ -105,18 +106,18 @@ def _why_not(feature: str) -> str:
 
 
 def comparison_table(run: Run, pairs: Sequence[Pair], thresholds: Sequence[Threshold]) -> str:
-    """Return learned policies against heuristics, per threshold and occlusion."""
+    """Return policies against others, per threshold; p is corrected for the rows of this table."""
     rows = [
         [
             f"{c.a[0]} - {c.b[0]}",
             "yes" if c.a[1] else "no",
-            f"{c.threshold.position_m:g} m / {c.threshold.rotation_deg:g} deg",
+            _words(c.threshold),
             f"{100 * c.difference:+.1f}",
             f"{100 * c.interval[0]:+.1f} .. {100 * c.interval[1]:+.1f}",
             f"{c.n_a_only:.1f} / {c.n_b_only:.1f}",
             f"{c.p:.4f}",
             f"{c.p_corrected:.4f}",
-            _verdict(c),
+            scores.verdict(c, margin=MARGIN),
         ]
         for c in scores.compare(run.trials, pairs, thresholds=thresholds, pose=run.protocol.pose, seed=run.seed)
     ]
@@ -124,30 +125,45 @@ def comparison_table(run: Run, pairs: Sequence[Pair], thresholds: Sequence[Thres
     return markdown(head, rows)
 
 
-def _verdict(found: scores.Comparison) -> str:
-    if found.interval[0] > 0.0:
-        return "better"
-    return f"not worse by {100 * MARGIN:.0f}" if found.interval[0] > -MARGIN else "open"
+def _words(threshold: Threshold) -> str:
+    return f"{threshold.position_m:g} m / {threshold.rotation_deg:g} deg"
 
 
-def distance_table(run: Run, pairs: Sequence[Pair], honest: float | None) -> str:
-    """Return which share of the distance from the heuristic to the best possible view the learned policy covers."""
-    bound = next(t for t in run.protocol.thresholds if (t.position_m, t.rotation_deg) == JUDGED)
+def distance_table(run: Run, pairs: Sequence[Pair], bound: Threshold, again: Labels | None) -> str:
+    """Return which share of the distance from the heuristic to the best possible view the learned policy covers.
+
+    ``again`` says which visits have a candidate that succeeds a second time, in the order of the run's plans.
+    """
     groups = scores.group(run.trials)
-    lucky = scores.recall(groups[scores.BEST_POSSIBLE, None], bound, pose=run.protocol.pose)
+    lucky = _hits(run, groups, (scores.BEST_POSSIBLE, None), bound)
+    bests = {"lucky": lucky} | ({} if again is None else {"repeatable": again.astype(np.float64)})
     rows = []
     for pair in pairs:
-        ours, theirs = (scores.recall(groups[variant], bound, pose=run.protocol.pose) for variant in pair)
-        cells = [f"{100 * _share(ours, theirs, best):.0f} %" for best in (lucky, honest) if best is not None]
-        named = [f"{policy} {100 * value:.1f}" for (policy, _), value in zip(pair, (ours, theirs), strict=True)]
+        ours, theirs = (_hits(run, groups, variant, bound) for variant in pair)
+        cells = [_share(ours, theirs, best, seed=run.seed) for best in bests.values()]
+        named = [f"{policy} {100 * hits.mean():.1f}" for (policy, _), hits in zip(pair, (ours, theirs), strict=True)]
         rows.append(["yes" if pair[0][1] else "no", *named, *cells])
-    names = [f"of the distance to {100 * lucky:.1f} (lucky)"]
-    names += [] if honest is None else [f"to {100 * honest:.1f} (repeatable)"]
+    names = [f"of the distance to {100 * best.mean():.1f} ({name}) [95 %]" for name, best in bests.items()]
     return markdown(["occlusion", "learned", "heuristic", *names], rows)
 
 
-def _share(ours: float, theirs: float, best: float) -> float:
-    return (ours - theirs) / (best - theirs) if best > theirs else math.nan
+def _hits(
+    run: Run, groups: Mapping[scores.Variant, Sequence[Trial]], variant: scores.Variant, bound: Threshold
+) -> Array:
+    """Return per visit, in the order of the plans, how much of a variant's choice is inside a threshold."""
+    found = scores.hits(groups[variant], bound, pose=run.protocol.pose)
+    return np.array([found.get((p.session, p.prior.visit), 0.0) for p in run.plans])
+
+
+def _share(ours: Array, theirs: Array, best: Array, *, seed: int) -> str:
+    """Return (ours - theirs) / (best - theirs) in % with the interval of 10,000 draws of visits."""
+    drawn = np.random.default_rng(seed).integers(0, len(ours), (10_000, len(ours)))
+    gain, room = (ours - theirs)[drawn].mean(axis=1), (best - theirs)[drawn].mean(axis=1)
+    low, high = (
+        np.percentile(gain[room > 0] / room[room > 0], [2.5, 97.5]) if (room > 0).any() else (math.nan, math.nan)
+    )
+    share = (ours - theirs).sum() / (best - theirs).sum() if best.sum() > theirs.sum() else math.nan
+    return f"{100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
 
 
 def said_and_true(dataset: Path, run: Run) -> dict[scores.Variant, tuple[Array, Labels]]:
@@ -160,7 +176,7 @@ def said_and_true(dataset: Path, run: Run) -> dict[scores.Variant, tuple[Array, 
             labels[name, waypoint] = dict(zip(shard.view_ids, shard.label.tolist(), strict=True))
     found: dict[scores.Variant, tuple[list[float], list[bool]]] = {}
     for plan in run.plans:
-        own = labels[plan.session.split("/")[-1], plan.prior.visit]
+        own = labels[plan.session, plan.prior.visit]
         for variant, utilities in plan.utilities.items():
             if variant[0] not in LEARNED:
                 continue
@@ -211,20 +227,40 @@ def main() -> None:
     parser.add_argument("--curves", type=Path)
     parser.add_argument("--reliability", type=Path)
     args = parser.parse_args()
-    run = read_run(args.run)
+    try:
+        report(args, read_run(args.run))
+    except FieldkitError as error:
+        sys.exit(str(error))
+
+
+def report(args: argparse.Namespace, run: Run) -> None:
+    """Print the tables of a run."""
+    if set(run.sessions) != set(read_dataset(args.dataset).scenes):
+        sys.exit(
+            f"{args.run}: is of {', '.join(run.sessions)}; expected the scenes of {args.dataset}, as replayed from it"
+        )
     print(recall_table(run), end="\n\n")
     chosen = zip((True, False), args.heuristics, strict=True)
-    wanted = [((args.learned, occlusion), (heuristic, occlusion)) for occlusion, heuristic in chosen]
+    declared = [((args.learned, occlusion), (heuristic, occlusion)) for occlusion, heuristic in chosen]
     known = scores.learned_pairs(run.trials)
-    pairs = [p for p in wanted if p in known]
-    if not pairs:
-        print(f"no rows of {args.learned} and {' and '.join(args.heuristics)} to compare", file=sys.stderr)
-    else:
-        bound = [t for t in run.protocol.thresholds if (t.position_m, t.rotation_deg) == JUDGED]
-        own = [p for p in known if p[0][0] == args.learned]
-        print(comparison_table(run, own, bound), end="\n\n")
-        print(comparison_table(run, pairs, run.protocol.thresholds), end="\n\n")
-        print(distance_table(run, pairs, repeatable(args.dataset) if args.repeatable else None))
+    for pair in declared:
+        if pair not in known:
+            sys.exit(f"{args.run}: has no rows to compare {pair[0][0]} with {pair[1][0]}; expected both, each way")
+    judged = [t for t in run.protocol.thresholds if (t.position_m, t.rotation_deg) == JUDGED]
+    if not judged or scores.BEST_POSSIBLE not in run.protocol.policies:
+        sys.exit(
+            f"{args.run}: has no {JUDGED[0]:g} m / {JUDGED[1]:g} deg or no best possible; expected a run of paper_sim"
+        )
+    others = [t for t in run.protocol.thresholds if t not in judged]
+    print("Declared before the run:", comparison_table(run, declared, judged), sep="\n\n", end="\n\n")
+    print("At the other thresholds:", comparison_table(run, declared, others), sep="\n\n", end="\n\n")
+    rest = [p for p in known if p not in declared]
+    print("Every other pair:", comparison_table(run, rest, judged), sep="\n\n", end="\n\n")
+    print(
+        "Intervals draw waypoints within these scenes anew; they do not say how much other buildings differ.",
+        end="\n\n",
+    )
+    print(distance_table(run, declared, judged[0], repeatable(args.dataset, run) if args.repeatable else None))
     found = said_and_true(args.dataset, run)
     if found:
         print("", reliability_table(found), sep="\n")

@@ -114,6 +114,7 @@ def replay_datasets(
         thumbnails={},
         excluded=excluded,
         weights={name: checkpoint.digest for name, checkpoint in checkpoints.items()},
+        trained_on={name: checkpoint.about.scenes for name, checkpoint in checkpoints.items()},
     )
     store.write_run(out, run, force=force)
     return run

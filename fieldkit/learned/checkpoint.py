@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from fieldkit.errors import StoreError, WeightsError
 from fieldkit.features.appearance import APPEARANCES
+from fieldkit.learned.batches import FULL_VIEW
+from fieldkit.protocol import CandidateRules
 from fieldkit.store.files import atomic_write, convert, digest, plain
 from fieldkit.views.features import normalisation
 
@@ -23,12 +25,27 @@ _KEY, _NETWORK, _APPEARANCE = "fieldkit", "network.", "appearance."
 WHAT = "a checkpoint of a learned policy, as `fieldkit train` writes it"
 
 
+def constants() -> dict[str, float]:
+    """Return by name the constants of what a network is given: it only understands those it was trained with."""
+    return normalisation() | {"full_view": FULL_VIEW}
+
+
+def visibility_of(rules: CandidateRules, *, tolerance_voxels: float) -> dict[str, float]:
+    """Return by name what decides which landmarks a view sees: other ones are not those that a network learned from."""
+    return {
+        "candidates.min_distance_m": rules.min_distance_m,
+        "candidates.max_distance_m": rules.max_distance_m,
+        "occlusion.tolerance_voxels": tolerance_voxels,
+    }
+
+
 class About(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the header of a checkpoint says.
 
     ``feature``, ``training_scenes``, ``validation_scenes``, ``dataset_digest`` and ``seed``: what the weights were
     trained on, and with. ``landmark_cap``: how many landmarks of a view are scored at most (None: all).
-    ``normalisation``: the constants of the features. The score is the probability of the log-odds
+    ``normalisation``: the constants of the features; ``visibility``: by which landmarks counted as seen, by the names
+    of the protocol (`visibility_of`), empty where that is not known. The score is the probability of the log-odds
     (second logit - first) / ``temperature`` + ``bias``, or of those named ``_unfiltered`` where
     hidden landmarks are not left out: as many visible ones then say less. ``appearance`` names the network of
     appearance, ``training`` are settings and results of the training as plain values.
@@ -47,9 +64,15 @@ class About(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     temperature_unfiltered: Annotated[float, msgspec.Meta(gt=0)] = 1.0
     bias_unfiltered: float = 0.0
     appearance: str | None = None
-    normalisation: dict[str, float] = msgspec.field(default_factory=normalisation)
+    normalisation: dict[str, float] = msgspec.field(default_factory=constants)
+    visibility: dict[str, float] = {}
     training: dict[str, Any] = {}
     versions: dict[str, str] = {}
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The scenes whose views had a part in the weights or in what they are taken to mean."""
+        return (*self.training_scenes, *self.validation_scenes)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -142,7 +165,7 @@ def _about(header: str, path: Path) -> About:
             f"{path}: has temperatures and biases {', '.join(f'{n:g}' for n in numbers)}; expected finite numbers",
             hint="train again",
         )
-    now = normalisation()
+    now = constants()
     other = next((k for k in sorted({*now, *about.normalisation}) if now.get(k) != about.normalisation.get(k)), None)
     if other is not None:
         raise WeightsError(

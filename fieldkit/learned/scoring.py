@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldkit.errors import WeightsError
 from fieldkit.features.weights import fill_network
 from fieldkit.learned.batches import padded
 from fieldkit.learned.checkpoint import Checkpoint
@@ -63,7 +64,7 @@ class Scorer:
 
         ``views`` are histograms f32[146] for an MLP, else tokens f32[k, 73 or 76] of landmarks, k may be 0. ``visible``
         is how many landmarks each view sees where its tokens are of some of them only; ``filtered`` whether those
-        behind the surface were left out.
+        behind the surface were left out. Raises WeightsError where a score is not finite.
         """
         return 1.0 / (1.0 + np.exp(-self.log_odds(views, visible=visible, filtered=filtered)))
 
@@ -82,7 +83,12 @@ class Scorer:
             for members, inputs in self._batches(views, [len(v) for v in views] if visible is None else visible):
                 logits = self._network(*map(torch.from_numpy, inputs)).double()
                 result[members] = ((logits[:, 1] - logits[:, 0]) / temperature + bias).numpy()
-        # The last bits depend on batches and threads: views that show the same tie
+        if not np.isfinite(result).all():
+            raise WeightsError(
+                f"{self.checkpoint.path or 'checkpoint'}: gives scores that are not finite; expected numbers",
+                hint="train it again, or get the file again",
+            )
+        # The last bits depend on batches and threads: views that show the same nearly always tie
         return np.round(result, _DIGITS)
 
     def _batches(

@@ -142,15 +142,18 @@ class Learned:
         """Return landmarks int32[k] of a view, and how much each raised its score, f32[k].
 
         That is the view's log-odds to localize, minus those if just this landmark were not seen: negative for one
-        that lowered the score. Of a view with more than 512 landmarks to score, 512 are asked for.
+        that lowered the score. Where a view sees more landmarks than are scored, the next one takes its place. Of a
+        view with more than 512 landmarks to score, 512 are asked for.
         """
-        seen = self._seen(scene)[view]
+        whole = seen_landmarks(scene.visible, scene.candidates, statistics=scene.statistics)[view]
+        seen = self._thinned(whole)
         asked = np.flatnonzero(np.isin(seen.landmark, thinned(seen, cap=_ASKED).landmark))
         everything = self._features(scene, seen)
         if self.about.kind == "mlp":
             without = [self._features(scene, seen.without(int(i))) for i in asked]
         else:
-            without = [np.delete(everything, i, axis=0) for i in asked]
+            spare = self._features(scene, self._next(whole, seen))
+            without = [np.concatenate([np.delete(everything, i, axis=0), spare]) for i in asked]
         visible = [seen.visible, *(len(asked) * [seen.visible - 1])]
         log_odds = self.scorer.log_odds([everything, *without], visible=visible, filtered=scene.filtered)
         return seen.landmark[asked], (log_odds[0] - log_odds[1:]).astype(np.float32)
@@ -158,8 +161,16 @@ class Learned:
     def _seen(self, scene: Scene) -> list[SeenLandmarks]:
         """Return what each view sees, no more than the weights were trained to look at."""
         views = seen_landmarks(scene.visible, scene.candidates, statistics=scene.statistics)
+        return [self._thinned(seen) for seen in views]
+
+    def _thinned(self, seen: SeenLandmarks) -> SeenLandmarks:
         cap = self.about.landmark_cap
-        return list(views) if cap is None else [thinned(seen, cap=cap) for seen in views]
+        return seen if cap is None else thinned(seen, cap=cap)
+
+    def _next(self, whole: SeenLandmarks, kept: SeenLandmarks) -> SeenLandmarks:
+        """Return the one landmark that would be kept if one of those kept were not there; none where all are kept."""
+        more = thinned(whole, cap=len(kept.landmark) + 1)
+        return more.rows(np.flatnonzero(~np.isin(more.landmark, kept.landmark)))
 
     def _features(self, scene: Scene, seen: SeenLandmarks) -> Floats:
         camera = scene.candidates.camera

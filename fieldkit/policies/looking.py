@@ -9,8 +9,8 @@ import numpy as np
 
 from fieldkit.errors import PolicyError
 from fieldkit.features import feature_name
-from fieldkit.learned.checkpoint import Checkpoint
-from fieldkit.policies.learned import open_learned, without_appearance
+from fieldkit.learned.checkpoint import Checkpoint, visibility_of
+from fieldkit.policies.learned import Learned, open_learned, without_appearance
 from fieldkit.policies.scene import Scene, look_at
 from fieldkit.policies.table import NOT_RANKED, POLICIES, Array, Policy, available, utility
 from fieldkit.protocol import LEARNED, Protocol
@@ -65,6 +65,18 @@ def warn_known(checkpoints: Mapping[str, Checkpoint], scenes: Sequence[str]) -> 
                 log.warning("%s was %s on %s: its rows there are no test", name, use, ", ".join(known))
 
 
+def _warn_visibility(learned: Mapping[str, Learned], protocol: Protocol) -> None:
+    """Log where a protocol counts other landmarks as seen than a network learned from."""
+    here = visibility_of(protocol.candidates, tolerance_voxels=protocol.occlusion.tolerance_voxels)
+    for name, policy in learned.items():
+        for what, value in policy.about.visibility.items():
+            if here.get(what, value) != value:
+                log.warning(
+                    "%s was trained with %s = %g, the protocol %s has %g: scores may be less sure here",
+                    *(name, what, value, protocol.name, here[what]),
+                )
+
+
 class Looker:
     """Compute every policy's utilities of candidates; landmark statistics, rays and networks are made once per map.
 
@@ -85,11 +97,17 @@ class Looker:
         lacking = {name: without_appearance(scene_map, c) for name, c in given.items()}
         self.excluded = tuple(e for e in lacking.values() if e is not None)
         self._learned = {name: open_learned(c, scene_map) for name, c in given.items() if lacking[name] is None}
+        _warn_visibility(self._learned, protocol)
 
     @property
     def weights(self) -> dict[str, str]:
         """The digests of the checkpoints of the learned policies that score here."""
         return {name: policy.scorer.checkpoint.digest for name, policy in self._learned.items()}
+
+    @property
+    def trained_on(self) -> dict[str, tuple[str, ...]]:
+        """The scenes that the learned policies which score here were trained or validated on."""
+        return {name: policy.about.scenes for name, policy in self._learned.items()}
 
     def utilities(self, candidates: Candidates) -> dict[Variant, Array]:
         """Return utilities f64[v] per policy and occlusion (None where the policy counts no landmarks).

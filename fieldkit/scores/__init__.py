@@ -10,7 +10,7 @@ both thresholds.
 """
 
 from fieldkit.scores.bounds import PRESETS, PoseName, error_of, excess, inside, preset, tightest
-from fieldkit.scores.comparing import Comparison, Variant, compare, holm, learned_pairs
+from fieldkit.scores.comparing import Comparison, Variant, compare, holm, learned_pairs, verdict
 from fieldkit.scores.summary import (
     Summary,
     cumulative,
@@ -22,7 +22,7 @@ from fieldkit.scores.summary import (
     weighted_median,
     wilson,
 )
-from fieldkit.scores.tables import Table, check_expect, format_number, score_dict, table
+from fieldkit.scores.tables import Table, check_expect, format_number, in_sample, score_dict, table
 from fieldkit.scores.trials import NO_CANDIDATE, ODOMETRY, make_trials
 from fieldkit.trust import BEST_POSSIBLE
 
@@ -45,6 +45,7 @@ __all__ = [
     "group",
     "hits",
     "holm",
+    "in_sample",
     "inside",
     "learned_pairs",
     "make_trials",
@@ -55,6 +56,7 @@ __all__ = [
     "summarize_run",
     "table",
     "tightest",
+    "verdict",
     "weighted_median",
     "wilson",
 ]

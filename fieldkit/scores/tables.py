@@ -47,6 +47,7 @@ def score_dict(run: Run, *, thresholds: Sequence[Threshold] | None = None) -> di
             }
             for s in summarize_run(run, thresholds=chosen)
         ],
+        "in_sample": {name: list(scenes) for name, scenes in in_sample(run).items()},
         "comparisons": [_comparison_dict(c) for c in _comparisons(run, chosen)],
         "truth": trust_dict(trust(run, thresholds=chosen)),
     }
@@ -112,11 +113,19 @@ def table(run: Run, *, thresholds: Sequence[Threshold] | None = None) -> Table:
         rows.append((s.policy, occlusion, str(s.n), *cells, *median))
     trusted = trust(run, thresholds=chosen)
     caption = f"Recall in % of visits, {pose} pose strictly inside both bounds [Wilson 95 %]; failures count."
+    known = [f"{name} was trained or validated on {', '.join(scenes)}" for name, scenes in in_sample(run).items()]
+    caption += f" No test: {'; '.join(known)}." if known else ""
     return Table(
         caption=caption if trusted is None else f"{caption} {open_words(trusted, chosen)}",
         header=("policy", "occlusion", "n", *columns, "median m", "median deg"),
         rows=tuple(rows),
     )
+
+
+def in_sample(run: Run) -> dict[str, tuple[str, ...]]:
+    """Return by learned policy the scenes of a run that it was trained or validated on: its rows there are no test."""
+    known = {name: tuple(s for s in run.sessions if s in scenes) for name, scenes in run.trained_on.items()}
+    return {name: scenes for name, scenes in known.items() if scenes}
 
 
 def format_number(value: float) -> str:

@@ -90,6 +90,7 @@ class _RunFile(msgspec.Struct, forbid_unknown_fields=True):
     corrections: list[Applied] = []
     map_seconds: dict[str, float] = {}
     weights: dict[str, str] = {}
+    trained_on: dict[str, tuple[str, ...]] = {}
 
 
 def write_run(path: Path, run: Run, *, force: bool = False) -> None:
@@ -98,7 +99,7 @@ def write_run(path: Path, run: Run, *, force: bool = False) -> None:
         head = _RunFile(
             1, protocols.to_dict(run.protocol), run.map_digest, run.tags_digest, list(run.recordings), run.seed,
             dict(run.versions), list(run.sessions), list(run.excluded), list(run.corrections),
-            dict(run.map_seconds), dict(run.weights),
+            dict(run.map_seconds), dict(run.weights), dict(run.trained_on),
         )  # fmt: skip
         write_table(folder / "trials.csv", TRIALS, (_trial_cells(t) for t in run.trials))
         write_table(folder / "estimates.csv", ESTIMATES, (_result_cells(r) for r in run.results))
@@ -144,6 +145,7 @@ def read_run(path: Path) -> Run:
         corrections=tuple(head.corrections),
         map_seconds=head.map_seconds,
         weights=head.weights,
+        trained_on=head.trained_on,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import TrainingError
-from fieldkit.learned.checkpoint import About, Checkpoint, Reduction, write_checkpoint
+from fieldkit.learned.checkpoint import About, Checkpoint, Reduction, visibility_of, write_checkpoint
 from fieldkit.learned.scoring import APPEARANCE_WIDTH
 from fieldkit.maps import appearance_path, known_appearances
 from fieldkit.store import digest, library_versions
@@ -118,9 +118,10 @@ def _about(
 ) -> About:
     filtered, unfiltered = calibrations
     done = {"rules": plain(dataclasses.asdict(rules)), "epochs": len(fitted.history), "best": fitted.best + 1}
+    views = split.validation.rules
     return About(
         kind=rules.model,
-        feature=split.validation.rules.feature,
+        feature=views.feature,
         landmark_cap=rules.cap,
         training_scenes=tuple(s.name for s in split.training),
         validation_scenes=(split.validation.name,),
@@ -131,6 +132,7 @@ def _about(
         temperature_unfiltered=unfiltered.temperature,
         bias_unfiltered=unfiltered.bias,
         appearance=APPEARANCE_OF.get(rules.model),
+        visibility=visibility_of(views.candidates, tolerance_voxels=views.tolerance_voxels),
         training={**done, **machine()},
         versions=_versions(),
     )

@@ -181,7 +181,7 @@ class Run:
 
     ``tags`` are those it was replayed with, None where it needed none or an older run does not hold them.
     ``map_seconds`` are those of building the map, per stage, where the map says so. ``weights`` are the digests of the
-    learned policies' checkpoints.
+    learned policies' checkpoints, ``trained_on`` the scenes that they were trained or validated on.
     """
 
     protocol: Protocol
@@ -203,3 +203,4 @@ class Run:
     corrections: tuple[Applied, ...] = ()
     map_seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
     weights: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    trained_on: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
