@@ -120,7 +120,7 @@ def replay(
     hand: Path | None = None,
     protocol: str = "paper_real",
     weights: Path | None = None,
-    policy_weights: Path | None = None,
+    policy_weights: Repeated[tuple[Path, ...]] = (),
     force: bool = False,
 ) -> int:
     """Replay recordings through every policy of a protocol; print the recall table, exit with 3 on a missed bound.
@@ -134,7 +134,8 @@ def replay(
         hand: hand.toml to use in place of what the recordings state, as of `tags check --refine-hand`
         protocol: name of a protocol, or a .toml file
         weights: folder where the weights of networks are looked for first
-        policy_weights: checkpoint of a learned policy, or a folder of them, to use in place of what fieldkit ships
+        policy_weights: checkpoint of a learned policy, or a folder of them, to use in place of what fieldkit ships; may
+            be repeated
         force: replace an existing run
     """
     from fieldkit import protocol as protocols

@@ -59,8 +59,11 @@ def cells(values: Sequence[object]) -> list[str]:
 
 
 def make_table(*header: str, title: str | None = None) -> Table:
-    """Return an empty table with its title on the left."""
-    return Table(*header, title=title, title_justify="left")
+    """Return an empty table with its title on the left; what names a row is never cut."""
+    table = Table(*header, title=title, title_justify="left")
+    if table.columns:
+        table.columns[0].no_wrap = True
+    return table
 
 
 def print_json(values: Any) -> None:

@@ -74,7 +74,7 @@ def replay(
     tags_path: Path | None = None,
     camera_path: Path | None = None,
     hand_path: Path | None = None,
-    policy_weights: Path | None = None,
+    policy_weights: Sequence[Path] = (),
     force: bool = False,
     progress: Progress | None = None,
 ) -> Run:

@@ -17,6 +17,12 @@ from fieldkit.console import ProgressBars, cells, make_table, print_json
 _log = logging.getLogger(__name__)
 
 
+def _logged(what: str, done: int, total: int) -> None:
+    """Tell every epoch in a line: bars that nobody sees would tell nothing until the end."""
+    if what.startswith("train "):
+        _log.info("epoch %d of %d: %s", done, total, what.partition(" | ")[2])
+
+
 def train(
     datasets: Positional[tuple[Path, ...]],
     *,
@@ -57,7 +63,8 @@ def train(
 
     rules = TrainingRules(model=model, seed=seed, epochs=epochs, patience=patience, cap=cap, drawn=drawn)
     try:
-        with ProgressBars() as progress:
+        with ProgressBars() as bars:
+            progress = bars if Console(stderr=True).is_terminal else _logged
             report = train_policy(
                 datasets, out, rules=rules, validate=validate, tests=test, force=force, progress=progress
             )

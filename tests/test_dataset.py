@@ -173,10 +173,11 @@ def test_a_folder_of_something_else_or_a_run_at_work_is_refused(tmp_path: Path, 
         make(tmp_path / "notes", force=True)
     with pytest.raises(StoreError, match=r"text.txt: is a file; expected a folder"):
         make(tmp_path / "notes" / "text.txt")
-    with (whole / ".lock").open("w") as stream:
+    held = Path(shutil.copytree(whole, tmp_path / "held"))
+    with (held / ".lock").open("w") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
-        with pytest.raises(DatasetError, match=r"set: another run is making it"):
-            make(whole)
+        with pytest.raises(DatasetError, match=r"held: another run is making it"):
+            make(held)
 
 
 @pytest.mark.parametrize("name", ["maps", "../up", ".hidden", ""])

@@ -122,7 +122,7 @@ def test_a_file_or_a_folder_of_weights_goes_before_what_is_shipped(tmp_path: Pat
     write_checkpoint(mine, seeded("vpt", seed=2))
     write_seeded(tmp_path / "folder", "mlp", seed=3)
     for given, seeds in ((None, (1, 1)), (mine, (1, 2)), (tmp_path / "folder", (3, 1))):
-        found, missing = policies.find_checkpoints(NAMES, given=given)
+        found, missing = policies.find_checkpoints(NAMES, given=[given])
         assert (found["mlp"].about.seed, found["vpt"].about.seed) == seeds
         assert [e.what for e in missing] == ["vpt_appearance", "vpt_dino"]
         assert "has no weights in this version" in missing[0].reason
@@ -144,17 +144,17 @@ def test_shipped_weights_rank_without_a_replay(
 def test_weights_that_are_not_meant_are_refused(tmp_path: Path, nothing_shipped: Path) -> None:
     folder = write_seeded(tmp_path / "folder", "vpt")
     with pytest.raises(WeightsError, match=r"folder: has weights of vpt; expected those of one .*: mlp"):
-        policies.find_checkpoints(("max", "mlp"), given=folder)
+        policies.find_checkpoints(("max", "mlp"), given=[folder])
     with pytest.raises(WeightsError, match="it has no learned policy"):
-        policies.find_checkpoints(("max",), given=folder)
+        policies.find_checkpoints(("max",), given=[folder])
     shutil.copy(folder / "vpt.safetensors", folder / "vpt_old.safetensors")
     with pytest.raises(WeightsError, match=r"vpt\.safetensors and vpt_old\.safetensors are both of the policy vpt"):
-        policies.find_checkpoints(("vpt",), given=folder)
+        policies.find_checkpoints(("vpt",), given=[folder])
     with pytest.raises(WeightsError, match="no such file"):
-        policies.find_checkpoints(("vpt",), given=tmp_path / "none")
+        policies.find_checkpoints(("vpt",), given=[tmp_path / "none"])
     (tmp_path / "empty").mkdir()
     with pytest.raises(WeightsError, match="has weights of no policy"):
-        policies.find_checkpoints(("vpt",), given=tmp_path / "empty")
+        policies.find_checkpoints(("vpt",), given=[tmp_path / "empty"])
     write_checkpoint(nothing_shipped / "mlp.safetensors", seeded("vpt"))
     with pytest.raises(WeightsError, match=r"mlp\.safetensors: is of the policy vpt; expected mlp"):
         policies.find_checkpoints(("mlp",))
@@ -205,7 +205,7 @@ def test_a_view_that_sees_nothing_rests_on_no_landmark(scene_map: SceneMap, cand
 def test_a_dataset_is_replayed_with_learned_rows_and_names_those_it_cannot_have(whole: Path, tmp_path: Path) -> None:
     weights = write_seeded(tmp_path / "weights", "mlp", "vpt", "vpt_appearance")
     rules = msgspec.structs.replace(PAPER, policies=NAMES)
-    replay_datasets([whole], protocol=rules, policy_weights=weights, out=tmp_path / "run")
+    replay_datasets([whole], protocol=rules, policy_weights=[weights], out=tmp_path / "run")
     run = store.read_run(tmp_path / "run")
     rows = {(s.policy, s.occlusion) for s in scores.summarize_run(run)}
     assert {("mlp", False), ("mlp", True), ("vpt", False), ("vpt", True)} <= rows
@@ -213,7 +213,7 @@ def test_a_dataset_is_replayed_with_learned_rows_and_names_those_it_cannot_have(
     reasons = {e.what: e.reason for e in run.excluded}
     assert "lacks the appearance efficientnet" in reasons["vpt_appearance"]
     assert "has no weights" in reasons["vpt_dino"]
-    assert run.weights == {k: policies.find_checkpoints([k], given=weights)[0][k].digest for k in ("mlp", "vpt")}
+    assert run.weights == {k: policies.find_checkpoints([k], given=[weights])[0][k].digest for k in ("mlp", "vpt")}
     for plan in run.plans:
         values = plan.utilities["vpt", True]
         assert (np.isfinite(values) == plan.candidates.allowed).all()
@@ -272,7 +272,7 @@ def test_rows_in_scenes_that_a_policy_was_trained_on_are_no_test(caplog: pytest.
 
 def test_a_run_keeps_on_which_scenes_its_policies_were_trained(whole: Path, tmp_path: Path) -> None:
     weights = write_seeded(tmp_path / "w", "mlp", training_scenes=("tiny", "office"))
-    run = replay_datasets([whole], protocol=RULES, out=tmp_path / "run", policy_weights=weights)
+    run = replay_datasets([whole], protocol=RULES, out=tmp_path / "run", policy_weights=[weights])
     again = store.read_run(tmp_path / "run")
     assert again.trained_on == run.trained_on == {"mlp": ("tiny", "office", "shop")}
     assert scores.in_sample(again) == {"mlp": ("tiny",)}

@@ -203,7 +203,7 @@ def test_learned_policies_choose_and_say_why(tmp_path: Path, short: Path) -> Non
         map_path=SAMPLE / "lab.map",
         tags_path=SAMPLE / "tags.toml",
         protocol=PAPER,
-        policy_weights=weights,
+        policy_weights=[weights],
         out=tmp_path / "run",
     )
     (plan,) = store.read_run(tmp_path / "run").plans

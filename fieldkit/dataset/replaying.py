@@ -74,7 +74,7 @@ def replay_datasets(
     *,
     protocol: Protocol,
     out: Path,
-    policy_weights: Path | None = None,
+    policy_weights: Sequence[Path] = (),
     force: bool = False,
     progress: Progress | None = None,
 ) -> Run:

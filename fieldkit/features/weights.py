@@ -124,6 +124,11 @@ def weights_first_in(folder: Path | None) -> Iterator[None]:
     It stands in FIELDKIT_WEIGHTS so long: for a whole command, whose steps open networks in several places.
     """
     before = os.environ.get("FIELDKIT_WEIGHTS")
+    if folder is not None and not Path(folder).is_dir():
+        raise WeightsError(
+            f"{folder}: no such folder; expected a folder with weight files",
+            hint="check --weights; checkpoints of learned policies are named by --policy-weights",
+        )
     if folder is not None:
         os.environ["FIELDKIT_WEIGHTS"] = str(folder)
     try:

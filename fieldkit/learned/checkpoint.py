@@ -21,6 +21,7 @@ from fieldkit.views.features import normalisation
 
 Floats = NDArray[np.float32]
 Kind = Literal["mlp", "vpt", "vpt_dino", "vpt_appearance"]
+Temperature = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 _KEY, _NETWORK, _APPEARANCE = "fieldkit", "network.", "appearance."
 WHAT = "a checkpoint of a learned policy, as `fieldkit train` writes it"
 
@@ -53,15 +54,15 @@ class About(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     version: Literal[1] = 1
     kind: Kind
-    feature: str
+    feature: Annotated[str, msgspec.Meta(min_length=1)]
     landmark_cap: Annotated[int, msgspec.Meta(ge=1)] | None
     training_scenes: tuple[str, ...]
     validation_scenes: tuple[str, ...]
     dataset_digest: str
     seed: int
-    temperature: Annotated[float, msgspec.Meta(gt=0)] = 1.0
+    temperature: Temperature = 1.0
     bias: float = 0.0
-    temperature_unfiltered: Annotated[float, msgspec.Meta(gt=0)] = 1.0
+    temperature_unfiltered: Temperature = 1.0
     bias_unfiltered: float = 0.0
     appearance: str | None = None
     normalisation: dict[str, float] = msgspec.field(default_factory=constants)
@@ -136,7 +137,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, TypeError) as error:
         raise WeightsError(
-            f"{path}: cut off or damaged ({error}); expected {WHAT}", hint="copy the file again, or train again"
+            f"{path}: no safetensors file, or cut off or damaged ({error}); expected {WHAT}",
+            hint="check the path, copy the file again, or train again",
         ) from error
     if header is None:
         raise WeightsError(f"{path}: has no {_KEY!r} in its header; expected {WHAT}", hint="check the path")
@@ -175,9 +177,10 @@ def _about(header: str, path: Path) -> About:
         )
     fitting = {None: ("mlp", "vpt"), "dinov2": ("vpt_dino",)}.get(about.appearance, ("vpt_appearance",))
     if about.kind not in fitting:
+        seen = f"with the appearance {about.appearance}" if about.appearance else "without appearance"
         raise WeightsError(
-            f"{path}: is a {about.kind} with the appearance {about.appearance!r}; expected {' or '.join(fitting)} with "
-            "it: no policy stands in for another under its name",
+            f"{path}: is a {about.kind} {seen}; "
+            f"expected {' or '.join(fitting)}: no policy stands in for another under its name",
             hint="train again",
         )
     return about

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from fieldkit.errors import WeightsError
 from fieldkit.features.weights import fill_network
@@ -47,7 +48,10 @@ def open_network(checkpoint: Checkpoint) -> torch.nn.Module:
         network = Mlp() if width is None else Vpt(tokens=width)
     network.to_empty(device="cpu")
     state = {name: torch.from_numpy(value.copy()) for name, value in checkpoint.weights.items()}
-    fill_network(network, state, path=Path(checkpoint.path or "checkpoint"))
+    try:
+        fill_network(network, state, path=Path(checkpoint.path or "checkpoint"))
+    except WeightsError as error:
+        raise WeightsError(error.message, hint="copy the file again, or train again") from error
     return network
 
 
@@ -66,7 +70,7 @@ class Scorer:
         is how many landmarks each view sees where its tokens are of some of them only; ``filtered`` whether those
         behind the surface were left out. Raises WeightsError where a score is not finite.
         """
-        return 1.0 / (1.0 + np.exp(-self.log_odds(views, visible=visible, filtered=filtered)))
+        return np.asarray(expit(self.log_odds(views, visible=visible, filtered=filtered)))
 
     def log_odds(
         self, views: Sequence[Floats], *, visible: Sequence[int] | None = None, filtered: bool = True

@@ -49,18 +49,19 @@ def _is_shipped(name: str) -> bool:
 
 
 def find_checkpoints(
-    names: Sequence[str], *, given: Path | None = None
+    names: Sequence[str], *, given: Sequence[Path] = ()
 ) -> tuple[dict[str, Checkpoint], tuple[Excluded, ...]]:
     """Return the checkpoints of those policies among ``names`` that are learned, and which of them have none.
 
-    ``given`` is a checkpoint of any name or a folder of them; it says itself which policy it is of. It goes before
-    what is shipped. Raises WeightsError when it is missing, damaged, holds two of one policy, or none of ``names``.
+    ``given`` are checkpoints of any name or folders of them; each says itself which policy it is of, and goes before
+    what is shipped. Raises WeightsError when one is missing or damaged, two are of one policy, or none is of ``names``.
     """
-    own = {} if given is None else _given(Path(given))
+    own = _given([Path(path) for path in given])
     wanted = [name for name in names if name in LEARNED]
-    if given is not None and not any(name in own for name in wanted):
+    if given and not any(name in own for name in wanted):
+        named = ", ".join(str(path) for path in given)
         raise WeightsError(
-            f"{given}: has weights of {', '.join(own) or 'no policy'}; expected those of one that the protocol names: "
+            f"{named}: has weights of {', '.join(own)}; expected those of one that the protocol names: "
             f"{', '.join(wanted) or 'it has no learned policy'}",
             hint="check --policy-weights and the protocol's policies",
         )
@@ -76,22 +77,28 @@ def find_checkpoints(
     return found, tuple(missing)
 
 
-def _given(path: Path) -> dict[str, Checkpoint]:
-    """Return the checkpoints of a file or folder by policy."""
-    if not path.exists():
-        raise WeightsError(f"{path}: no such file; expected a checkpoint or a folder of them", hint="check the path")
-    files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+def _given(paths: Sequence[Path]) -> dict[str, Checkpoint]:
+    """Return the checkpoints of files and folders by policy."""
     result: dict[str, Checkpoint] = {}
-    for file in files:
+    for file in (file for path in paths for file in _files(path)):
         checkpoint = read_checkpoint(file)
         kind = checkpoint.about.kind
         if kind in result:
             raise WeightsError(
-                f"{path}: {Path(result[kind].path).name} and {file.name} are both of the policy {kind}; expected one",
+                f"{file}: is of the policy {kind}, as {result[kind].path} is; expected one",
                 hint="name the file that is meant",
             )
         result[kind] = checkpoint
     return result
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.exists():
+        raise WeightsError(f"{path}: no such file; expected a checkpoint or a folder of them", hint="check the path")
+    files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+    if not files:
+        raise WeightsError(f"{path}: holds no *{SUFFIX}; expected checkpoints", hint="check the path")
+    return files
 
 
 def _checkpoint(path: Path, name: str) -> Checkpoint:

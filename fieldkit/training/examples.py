@@ -216,14 +216,17 @@ def split_scenes(scenes: Sequence[SceneFolder], *, validate: str | None = None, 
     then by name. Raises TrainingError when there is no such scene or no other, when two scenes are the same place, or
     one is in a dataset that is kept for ``tests``.
     """
-    names = [s.name for s in scenes]
+    names, where = [s.name for s in scenes], ", ".join(dict.fromkeys(str(s.folder) for s in scenes))
     if len(names) < 2:
         raise TrainingError(
-            f"{len(names)} scene to train and validate on ({', '.join(names)}); expected at least two",
+            f"{where or 'no dataset'}: {len(names) or 'no'} scene to train and validate on; expected at least two",
             hint="give a dataset of more scenes, or more datasets",
         )
     if validate is not None and validate not in names:
-        raise TrainingError(f"no scene {validate!r} to validate on", hint=suggestion(validate, names))
+        raise TrainingError(
+            f"{where}: no scene {validate!r} to validate on; expected one of {', '.join(names)}",
+            hint=suggestion(validate, names),
+        )
     for number, scene in enumerate(scenes):
         _refuse_same_place(scene, scenes[:number])
         _refuse_tested(scene, tests)

@@ -95,8 +95,8 @@ def fit(
 def _told(rules: TrainingRules, history: tuple[Epoch, ...], best: int) -> str:
     now = history[-1]
     return (
-        f"train {rules.model} | loss {now.loss:.3f}, validation loss {now.validation_loss:.3f}, chosen well "
-        f"{100 * now.chosen:.1f} % (kept: epoch {best + 1}, {history[best].validation_loss:.3f})"
+        f"train {rules.model} | loss {now.loss:.3f}, validation {now.validation_loss:.3f}, "
+        f"kept {history[best].validation_loss:.3f} of epoch {best + 1}"
     )
 
 
@@ -230,7 +230,6 @@ def _moments(optimizer: torch.optim.Optimizer) -> dict[str, NDArray[Any]]:
 
 
 def _restore(network: torch.nn.Module, optimizer: torch.optim.Optimizer, state: State) -> None:
-
     network.load_state_dict({name: _tensor(value) for name, value in state.network.items()})
     moments: dict[int, dict[str, torch.Tensor]] = {}
     for key, value in state.optimizer.items():

@@ -47,19 +47,19 @@ class TrainingRules:
         }
         for name, value in counts.items():
             if value is not None and value < (2 if name == "batch" else 1):
-                raise TrainingError(f"{name} is {value}; expected a positive number", hint=f"choose another {name}")
+                raise TrainingError(f"{name} is {value}; expected a positive number", hint=f"give another {name}")
         if self.patience < 0:
-            raise TrainingError(f"patience is {self.patience}; expected 0 or more", hint="choose another patience")
+            raise TrainingError(f"patience is {self.patience}; expected 0 or more", hint="give another patience")
         if self.model == "mlp" and (self.cap, self.drawn) != (None, None):
             raise TrainingError(
                 "the model mlp takes all landmarks; expected no cap", hint="leave --cap and --drawn out"
             )
         if not 0 <= self.seed < 2**31:
-            raise TrainingError(f"seed is {self.seed}; expected 0..{2**31 - 1}", hint="choose another seed")
+            raise TrainingError(f"seed is {self.seed}; expected 0..{2**31 - 1}", hint="give another seed")
         sizes = {"learning_rate": self.learning_rate, "weight_decay": self.weight_decay, "jitter": self.jitter}
         for name, size in sizes.items():
             if not (math.isfinite(size) and size >= 0):
-                raise TrainingError(f"{name} is {size:g}; expected 0 or more", hint=f"choose another {name}")
+                raise TrainingError(f"{name} is {size:g}; expected 0 or more", hint=f"give another {name}")
         if not 0 <= self.occluded <= 1:
             raise TrainingError(f"occluded is {self.occluded:g}; expected a share", hint="choose 0..1")
 

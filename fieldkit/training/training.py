@@ -70,9 +70,10 @@ def train(
     rules, out = (rules or TrainingRules()).settled(), Path(out)
     _refuse_out(out, force=force)
     split = split_scenes(find_scenes(datasets), validate=validate, tests=tests)
+    _refuse_without_appearance(split, rules)
     scenes = [read_examples(s, progress=progress) for s in (*split.training, split.validation)]
     _refuse_one_class(split, scenes)
-    reduction = _reduction(scenes[:-1], split, rules)
+    reduction = _reduction(scenes[:-1], rules)
     training, validation = (_inputs(part, rules, reduction, progress) for part in (scenes[:-1], scenes[-1:]))
     material = Material(training, validation, scenes[-1].waypoint)
     data = _data_digest(split, APPEARANCE_OF.get(rules.model))
@@ -149,7 +150,7 @@ def _refuse_one_class(split: Split, scenes: Sequence[Examples]) -> None:
             raise TrainingError(
                 f"{', '.join(folders)}: in the {use} scene{'s' if len(own) > 1 else ''} "
                 f"{', '.join(e.scene for e in own)} {what}; expected views of both labels",
-                hint="choose other scenes, or another label threshold when the dataset is made",
+                hint="choose other scenes, or make a dataset of more waypoints",
             )
 
 
@@ -173,14 +174,11 @@ def _network(rules: TrainingRules) -> torch.nn.Module:
     return network
 
 
-def _reduction(scenes: Sequence[Examples], split: Split, rules: TrainingRules) -> Reduction | None:
-    """Return how the appearance that a model takes becomes numbers, None where it takes none.
-
-    Raises TrainingError for a scene whose map has no such appearance.
-    """
+def _refuse_without_appearance(split: Split, rules: TrainingRules) -> None:
+    """Raise TrainingError for a scene whose map lacks the appearance that a model takes."""
     network = APPEARANCE_OF.get(rules.model)
     if network is None:
-        return None
+        return
     for scene in (*split.training, split.validation):
         folder = map_path(scene.folder, scene.entry)
         if network not in known_appearances(folder):
@@ -188,7 +186,12 @@ def _reduction(scenes: Sequence[Examples], split: Split, rules: TrainingRules) -
                 f"{folder}: has no appearance of its landmarks by {network}, which {rules.model} takes; expected it",
                 hint=f"add it: sim-bridge dataset with the same options and --appearance {network}",
             )
-    return fit_reduction([s.appearance[network] for s in scenes])
+
+
+def _reduction(scenes: Sequence[Examples], rules: TrainingRules) -> Reduction | None:
+    """Return how the appearance that a model takes becomes numbers, None where it takes none."""
+    network = APPEARANCE_OF.get(rules.model)
+    return None if network is None else fit_reduction([s.appearance[network] for s in scenes])
 
 
 def _inputs(
