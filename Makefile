@@ -82,7 +82,7 @@ table-sim: install
 	$(BIN)/fieldkit replay $(TABLE)/sift --protocol paper_sim --out $(TABLE)/run-sift --force
 	$(BIN)/fieldkit replay $(TABLE)/aliked --protocol paper_sim_aliked --out $(TABLE)/run-aliked --force
 	$(BIN)/python docs/examples/sim_table.py $(TABLE)/sift $(TABLE)/run-sift --learned $(LEARNED) --heuristics $(HEURISTICS) \
-	    --repeatable --curves $(TABLE)/curves.svg --reliability $(TABLE)/reliability.svg
+	    --repeatable --curves $(TABLE)/curves.png --reliability $(TABLE)/reliability.png
 	$(BIN)/python docs/examples/sim_table.py $(TABLE)/aliked $(TABLE)/run-aliked --learned $(LEARNED) --heuristics $(HEURISTICS)
 
 clean:

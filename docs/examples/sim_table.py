@@ -3,8 +3,8 @@
 ``python docs/examples/sim_table.py DATASET RUN --learned vpt --heuristics max angle``, where RUN was written by
 ``fieldkit replay DATASET``, and the policies (heuristics with and without the occlusion filter) are those that
 were best in the training and validation scenes. With ``--repeatable`` the candidates that succeeded are localized
-again, so that best possible is also told without its luck (minutes). ``--curves FILE.svg`` draws the cumulative errors,
-``--reliability FILE.svg`` what learned policies said and what came.
+again, so that best possible is also told without its luck (minutes). ``--curves FILE.png`` draws the cumulative errors,
+``--reliability FILE.png`` what learned policies said and what came.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from fieldkit.frames import pose_error
 from fieldkit.localize import Localizer, Query
 from fieldkit.maps import load_map
 from fieldkit.protocol import LEARNED, Threshold
-from fieldkit.report.figures import curve_svg
+from fieldkit.report.palette import style
 from fieldkit.store import read_run
 from fieldkit.store.datasets import DatasetRules, Shard, map_path, read_dataset, read_scene, read_scene_shard, row_pose
 from fieldkit.training import reliability
@@ -199,22 +199,43 @@ def reliability_table(found: Mapping[scores.Variant, tuple[Array, Labels]]) -> s
     return markdown(["policy", "occlusion", "views", "Brier", "of the mean rate", "log loss", "off by, mean"], rows)
 
 
+def draw_curves(run: Run, path: Path) -> None:
+    """Draw the share of visits below a position error, per policy: with the occlusion filter, and without."""
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    both = figure.subplots(1, 2, sharey=True)
+    groups = scores.group(run.trials, order=run.protocol.policies)
+    for axes, use in zip(both, (True, False), strict=True):
+        for (policy, occlusion), trials in groups.items():
+            if occlusion in (None, use):
+                errors, share = scores.cumulative(trials, pose=run.protocol.pose, part="position")
+                axes.step(errors, 100 * share, where="post", color=style(policy, None).colour, label=policy)
+        for bound in run.protocol.thresholds:
+            axes.axvline(bound.position_m, color="#c3ccd4", linewidth=0.8, zorder=0)
+        title = "occlusion filter" if use else "no occlusion filter"
+        axes.set(xscale="log", xlim=(1e-3, 2.5), ylim=(0, 100), xlabel="position error (m)", title=title)
+    both[0].set_ylabel("waypoints (%)")
+    both[1].legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.savefig(path, dpi=110)
+
+
 def draw_reliability(found: Mapping[scores.Variant, tuple[Array, Labels]], path: Path) -> None:
     """Draw what was said against what localized, in ten bins per learned policy; areas are numbers of views."""
-    figure = Figure(figsize=(5.0, 4.6), layout="constrained")
-    axes = figure.add_subplot()
-    axes.plot([0, 1], [0, 1], color="#c3ccd4", linewidth=1.0, zorder=0)
-    for (policy, occlusion), (said, true) in found.items():
-        r = reliability(said, true)
-        there = np.array(r.views) > 0
-        x, y, n = np.array(r.said)[there], np.array(r.localized)[there], np.array(r.views)[there]
-        (line,) = axes.plot(
-            x, y, "-" if occlusion else "--", linewidth=1.4, label=policy + (", filter" if occlusion else "")
-        )
-        axes.scatter(x, y, s=120 * n / n.max() + 4, color=line.get_color())
-    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="said to localize", ylabel="localized", aspect="equal")
-    axes.legend(frameon=False)
-    figure.savefig(path)
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    both = figure.subplots(1, 2, sharey=True)
+    for axes, use in zip(both, (True, False), strict=True):
+        axes.plot([0, 1], [0, 1], color="#c3ccd4", linewidth=1.0, zorder=0)
+        for (policy, occlusion), (said, true) in found.items():
+            if occlusion is use:
+                r = reliability(said, true)
+                there = np.array(r.views) > 0
+                x, y, n = np.array(r.said)[there], np.array(r.localized)[there], np.array(r.views)[there]
+                axes.plot(x, y, color=style(policy, None).colour, label=policy)
+                axes.scatter(x, y, s=120 * n / n.max() + 4, color=style(policy, None).colour)
+        title = "occlusion filter" if use else "no occlusion filter"
+        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="said to localize", title=title, aspect="equal")
+    both[0].set_ylabel("localized")
+    both[0].legend(frameon=False)
+    figure.savefig(path, dpi=110)
 
 
 def main() -> None:
@@ -267,7 +288,7 @@ def report(args: argparse.Namespace, run: Run) -> None:
     if found and args.reliability is not None:
         draw_reliability(found, args.reliability)
     if args.curves is not None:
-        args.curves.write_text(curve_svg(run, "position", name="curves"), encoding="utf-8")
+        draw_curves(run, args.curves)
 
 
 if __name__ == "__main__":
