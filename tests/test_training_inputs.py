@@ -19,6 +19,7 @@ from fieldkit.training.inputs import Arrays, HistogramInputs, TokenInputs, _mirr
 from fieldkit.types import Candidates
 from fieldkit.views import TOKEN_WIDTH, Visibility
 
+Floats = NDArray[np.float32]
 FEW = 8
 FULL_VIEW = 1024
 
@@ -40,6 +41,10 @@ def rules(**changes: float) -> TrainingRules:
 
 def everything(scenes: list[Examples]) -> NDArray[np.int64]:
     return np.arange(sum(len(s.label) for s in scenes))
+
+
+def floats(arrays: Arrays) -> list[Floats]:
+    return [np.asarray(a, dtype=np.float32) for a in arrays]
 
 
 def numbers_visible(scenes: list[Examples], *, occlusion: bool) -> NDArray[np.int64]:
@@ -86,34 +91,34 @@ def test_the_landmarks_learned_from_stand_for_all_that_a_view_sees(scenes: list[
     visible = numbers_visible(scenes, occlusion=False)
     assert (visible > FEW).sum() > 10
     rng = np.random.default_rng(0)
-    tokens, weight = inputs.varied(views, np.zeros(len(views), dtype=bool), rng)
+    tokens, weight = floats(inputs.varied(views, np.zeros(len(views), dtype=bool), rng))
     kept = np.minimum(visible, FEW)
     for row, (few, many) in enumerate(zip(kept, visible, strict=True)):
         np.testing.assert_allclose(weight[row, :few], many / few, rtol=1e-6)
         assert weight[row, few] == FULL_VIEW - many
         assert not weight[row, few + 1 :].any()
     # The next time it learns from others: neither mirror nor landmark changes how near mapping saw one
-    other, _ = inputs.varied(views, np.zeros(len(views), dtype=bool), rng)
-    first, second = (np.sort(np.asarray(t)[visible > 2 * FEW, :FEW, 1]) for t in (tokens, other))
+    other, _ = floats(inputs.varied(views, np.zeros(len(views), dtype=bool), rng))
+    first, second = (np.sort(t[visible > 2 * FEW, :FEW, 1]) for t in (tokens, other))
     assert len(first) > 10
     assert (first != second).any(axis=1).all()
 
 
 def varied_and_plain(
     inputs: HistogramInputs | TokenInputs, scenes: list[Examples], rng: np.random.Generator
-) -> tuple[Arrays, Arrays]:
+) -> tuple[list[Floats], list[Floats]]:
     """Return views as they are learned, every third without those behind the surface, and the same as scored."""
     views = everything(scenes)
     occlusion = views % 3 == 0
-    parts = [inputs.plain(views[k : k + 1], occlusion=bool(use)) for k, use in enumerate(occlusion)]
-    varied = inputs.varied(views, occlusion, rng)
-    plain = []
+    parts = [floats(inputs.plain(views[k : k + 1], occlusion=bool(use))) for k, use in enumerate(occlusion)]
+    varied, plain = floats(inputs.varied(views, occlusion, rng)), []
     for found, rows in zip(varied, zip(*parts, strict=True), strict=True):
         stacked = np.zeros_like(found)
         for k, row in enumerate(rows):
-            stacked[(k, *(slice(n) for n in row.shape[1:]))] = row[0]
+            place: tuple[int | slice, ...] = (k, *map(slice, row.shape[1:]))
+            stacked[place] = row[0]
         plain.append(stacked)
-    return varied, tuple(plain)
+    return varied, plain
 
 
 @pytest.mark.parametrize("kind", ["histograms", "tokens"])
@@ -123,7 +128,7 @@ def test_without_jitter_a_view_is_learned_as_it_is_scored_or_in_a_mirror(kind: s
     mirrors = set()
     for seed in range(6):
         varied, plain = varied_and_plain(inputs, scenes, np.random.default_rng(seed))
-        as_it_is = np.asarray(plain[0], dtype=np.float32)
+        as_it_is = plain[0]
         if kind == "histograms":
             in_mirror = _mirrored(as_it_is)
         else:
@@ -142,8 +147,7 @@ def test_without_jitter_a_view_is_learned_as_it_is_scored_or_in_a_mirror(kind: s
 def test_the_noise_on_counts_is_a_third_of_a_count_and_another_on_each(scenes: list[Examples]) -> None:
     (varied,), (plain,) = varied_and_plain(HistogramInputs(scenes, rules()), scenes, np.random.default_rng(0))
     # A mirror leaves what says nothing of left and right, and no noise reaches 0 or 1 from a fifth or four
-    off = (np.asarray(varied) - np.asarray(plain))[:, [*range(62), *range(136, 146)]]
-    before = np.asarray(plain)[:, [*range(62), *range(136, 146)]]
+    off, before = (values[:, [*range(62), *range(136, 146)]] for values in (varied - plain, plain))
     assert not off[before == 0.0].any()
     inside = off[(before > 0.2) & (before < 0.8)]
     assert inside.size > 300
@@ -154,8 +158,8 @@ def test_the_noise_on_counts_is_a_third_of_a_count_and_another_on_each(scenes: l
 
 def test_the_noise_on_landmarks_is_the_documented_one_and_another_on_each(scenes: list[Examples]) -> None:
     (varied, _), (plain, weight) = varied_and_plain(TokenInputs(scenes, rules()), scenes, np.random.default_rng(0))
-    there = (np.asarray(weight) == 1.0) & np.any(np.asarray(plain) != 0.0, axis=2)
-    after, before = (np.asarray(t, dtype=np.float64)[there] for t in (varied, plain))
+    there = (weight == 1.0) & np.any(plain != 0.0, axis=2)
+    after, before = (t[there] for t in (varied, plain))
     for column in (0, 1, 2):
         ratio = np.log(after[:, column] / before[:, column])[(before[:, column] > 0.1) & (before[:, column] < 0.6)]
         assert ratio.size > 100

@@ -54,14 +54,14 @@ def counted(landmark: Landmark) -> NDArray[np.int64]:
     )
     seen = SeenLandmarks(
         landmark=np.array([0], dtype=np.int32),
-        uv_px=np.array([landmark.place], dtype=np.float32) * np.float32([CAMERA.width, CAMERA.height]),
+        uv_px=np.array([landmark.place], dtype=np.float32) * np.array([CAMERA.width, CAMERA.height], dtype=np.float32),
         distance_m=np.array([landmark.distance_m], dtype=np.float32),
         angle_rad=np.array([0.2], dtype=np.float32),
         off_mean_rad=np.radians([landmark.off_mean_deg]).astype(np.float32),
         visible=1,
     )
     scaled = view_histograms(seen, known, camera=CAMERA).astype(np.float64)
-    return np.rint(np.expm1(scaled * np.log(4097))).astype(np.int64)
+    return np.asarray(np.rint(np.expm1(scaled * np.log(4097))), dtype=np.int64)
 
 
 # Bins of half a metre, of 6 deg, of 0.4 octaves from -2, of 9 deg, eighths and tenths of the image
