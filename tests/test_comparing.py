@@ -53,7 +53,7 @@ def test_p_of_whole_hits_is_that_of_mcnemar_s_exact_test() -> None:
 
 def test_the_interval_covers_the_true_difference_in_95_of_100_experiments() -> None:
     rng = np.random.default_rng(1)
-    covered, false = 0, 0
+    covered, false, widths = 0, 0, []
     for seed in range(200):
         base = rng.random(120)
         a, b = (base < 0.6).astype(float), ((base + 0.15 * rng.standard_normal(120)) < 0.5).astype(float)
@@ -61,12 +61,17 @@ def test_the_interval_covers_the_true_difference_in_95_of_100_experiments() -> N
         pair = (("vpt", True), ("max", True))
         (found,) = compare(rows, [pair], thresholds=[BOUND], pose="cam", seed=seed, resamples=500)
         covered += found.interval[0] <= 0.1005 <= found.interval[1]
+        # A normal interval, with the variance of visits drawn within their two sessions
+        deviation = np.sqrt(np.mean([np.var((a - b)[session::2]) for session in (0, 1)]) / 120)
+        widths.append((found.interval[1] - found.interval[0]) / (2 * deviation))
         same = rng.permuted(np.stack([a, b], axis=1), axis=1)
         rows = trials("vpt", same[:, 0]) + trials("max", same[:, 1])
         (found,) = compare(rows, [pair], thresholds=[BOUND], pose="cam", seed=seed, resamples=500)
         false += found.p < 0.05
-    assert 0.90 <= covered / 200 <= 0.99
-    assert false / 200 < 0.09
+    assert 0.92 <= covered / 200 <= 0.99
+    # 1.64 for an interval of 90 %, 2.58 for one of 99 %
+    assert np.mean(widths) == pytest.approx(stats.norm.ppf(0.975), rel=0.05)
+    assert 0.01 < false / 200 < 0.09
 
 
 def test_visits_are_drawn_within_their_sessions() -> None:

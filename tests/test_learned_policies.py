@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from seeded_weights import seeded, write_seeded
-from test_policies import look, make_candidates, make_map
+from test_policies import look, make_candidates, make_map, wall
 from tiny_source import SOURCE
 
 from fieldkit import policies, protocol, scores, store
@@ -20,6 +20,7 @@ from fieldkit.dataset import replay_datasets
 from fieldkit.errors import MapError, PolicyError, WeightsError
 from fieldkit.features.appearance import APPEARANCES
 from fieldkit.learned.checkpoint import visibility_of, write_checkpoint
+from fieldkit.learned.scoring import Scorer
 from fieldkit.maps import add_appearance, compact_map, load_map
 from fieldkit.maps.appearance import appearance_path, write_appearance
 from fieldkit.policies import learned
@@ -27,6 +28,7 @@ from fieldkit.protocol import OcclusionRules, Protocol, Threshold
 from fieldkit.report import render
 from fieldkit.store.datasets import map_path, read_dataset, read_scene
 from fieldkit.types import Candidates, SceneMap
+from fieldkit.views import landmark_tokens, seen_landmarks, thinned
 
 PAPER = protocol.load("paper_sim")
 NAMES = ("random", "max", "mlp", "vpt", "vpt_appearance", "vpt_dino", "best_possible")
@@ -72,6 +74,53 @@ def test_every_allowed_view_has_a_score_also_one_that_sees_nothing(
     assert values[7] == -np.inf
     assert ((values[:7] > 0) & (values[:7] < 1)).all()
     assert len(set(values[:7].round(6).tolist())) > 3
+
+
+@pytest.mark.parametrize("kind", ["mlp", "vpt"])
+def test_views_with_and_without_the_filter_are_calibrated_each_in_its_own_way(
+    kind: str, scene_map: SceneMap, candidates: Candidates
+) -> None:
+    # A surface that hides nothing: what the two rows say differs by their calibrations only
+    known = dataclasses.replace(scene_map, surface=wall(50.0))
+    rules = msgspec.structs.replace(RULES, occlusion=OcclusionRules(use=(False, True)))
+    plain = policies.Looker(known, rules, checkpoints={kind: seeded(kind)})
+    numbers = {"temperature": 2.0, "bias": -0.5, "temperature_unfiltered": 4.0, "bias_unfiltered": 1.0}
+    looker = policies.Looker(known, rules, checkpoints={kind: seeded(kind, **numbers)})
+    neutral, found = plain.utilities(candidates), looker.utilities(candidates)
+    raw = log_odds_of(neutral[kind, False][:7])
+    np.testing.assert_array_equal(neutral[kind, True], neutral[kind, False])
+    np.testing.assert_allclose(log_odds_of(found[kind, True][:7]), raw / 2.0 - 0.5, atol=2e-5)
+    np.testing.assert_allclose(log_odds_of(found[kind, False][:7]), raw / 4.0 + 1.0, atol=2e-5)
+    for filtered, temperature in ((True, 2.0), (False, 4.0)):
+        scene = plain._scene(candidates, occlusion=filtered)
+        raised = [policies.open_learned(seeded(kind, **n), known).raised(scene, 0)[1] for n in ({}, numbers)]
+        np.testing.assert_allclose(raised[1], raised[0] / temperature, atol=2e-5)
+        assert np.ptp(raised[0]) > 1e-3
+
+
+def log_odds_of(scores: np.ndarray) -> np.ndarray:
+    return np.asarray(np.log(scores / (1.0 - scores)))
+
+
+def test_the_landmarks_that_are_scored_stand_for_all_that_a_view_sees(
+    scene_map: SceneMap, candidates: Candidates
+) -> None:
+    checkpoint = seeded("vpt", landmark_cap=16)
+    looker = policies.Looker(scene_map, RULES, checkpoints={"vpt": checkpoint})
+    scene, scorer = looker._scene(candidates, occlusion=False), Scorer(checkpoint)
+    seen = [thinned(s, cap=16) for s in seen_landmarks(scene.visible, candidates, statistics=scene.statistics)][:7]
+    visible = [len(i) for i in scene.visible.landmarks[:7]]
+    assert sum(n > 16 for n in visible) >= 5
+    tokens = [landmark_tokens(s, scene.statistics, heat_maps=scene.heat_maps, camera=candidates.camera) for s in seen]
+    values = looker.utilities(candidates)["vpt", False][:7]
+    np.testing.assert_allclose(values, scorer.scores(tokens, visible=visible), atol=1e-5)
+    assert np.abs(values - scorer.scores(tokens)).max() > 1e-3
+    landmarks, raised = policies.open_learned(checkpoint, scene_map).raised(scene, 0)
+    np.testing.assert_array_equal(landmarks, seen[0].landmark)
+    every = scorer.log_odds(tokens[:1], visible=visible[:1])
+    less = [np.delete(tokens[0], i, axis=0) for i in range(16)]
+    without = scorer.log_odds(less, visible=16 * [visible[0] - 1])
+    np.testing.assert_allclose(raised, every - without, atol=2e-5)
 
 
 def test_appearance_counts_where_it_is_used(scene_map: SceneMap, candidates: Candidates) -> None:

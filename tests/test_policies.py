@@ -95,6 +95,14 @@ def test_a_wall_hides_what_is_behind_it_only_with_the_filter(scene_map: SceneMap
     assert utilities(scene_map, candidates, "max", rays=rays).tolist() == [0, 5]
 
 
+def test_only_the_rows_with_the_filter_are_filtered(scene_map: SceneMap) -> None:
+    known = dataclasses.replace(scene_map, surface=wall(2.0))
+    candidates = make_candidates(look([0, 0, 0], 0), look([0, 0, 0], 90))
+    found = policies.Looker(known, protocol_with(use=(False, True))).utilities(candidates)
+    assert found["max", False].tolist() == [20, 5]
+    assert found["max", True].tolist() == [0, 5]
+
+
 def test_the_surface_that_carries_a_landmark_does_not_hide_it(scene_map: SceneMap) -> None:
     rays = RayCaster(wall(2.97))
     assert utilities(scene_map, make_candidates(look([0, 0, 0], 0)), "max", rays=rays).tolist() == [20]
