@@ -115,12 +115,6 @@ def test_the_landmarks_that_are_scored_stand_for_all_that_a_view_sees(
     values = looker.utilities(candidates)["vpt", False][:7]
     np.testing.assert_allclose(values, scorer.scores(tokens, visible=visible), atol=1e-5)
     assert np.abs(values - scorer.scores(tokens)).max() > 1e-3
-    landmarks, raised = policies.open_learned(checkpoint, scene_map).raised(scene, 0)
-    np.testing.assert_array_equal(landmarks, seen[0].landmark)
-    every = scorer.log_odds(tokens[:1], visible=visible[:1])
-    less = [np.delete(tokens[0], i, axis=0) for i in range(16)]
-    without = scorer.log_odds(less, visible=16 * [visible[0] - 1])
-    np.testing.assert_allclose(raised, every - without, atol=2e-5)
 
 
 def test_appearance_counts_where_it_is_used(scene_map: SceneMap, candidates: Candidates) -> None:
@@ -170,8 +164,14 @@ def test_a_file_or_a_folder_of_weights_goes_before_what_is_shipped(tmp_path: Pat
     mine = tmp_path / "mine.safetensors"
     write_checkpoint(mine, seeded("vpt", seed=2))
     write_seeded(tmp_path / "folder", "mlp", seed=3)
-    for given, seeds in ((None, (1, 1)), (mine, (1, 2)), (tmp_path / "folder", (3, 1))):
-        found, missing = policies.find_checkpoints(NAMES, given=[given])
+    given_and_seeds = (
+        ([], (1, 1)),
+        ([mine], (1, 2)),
+        ([tmp_path / "folder"], (3, 1)),
+        ([mine, tmp_path / "folder"], (3, 2)),
+    )
+    for given, seeds in given_and_seeds:
+        found, missing = policies.find_checkpoints(NAMES, given=given)
         assert (found["mlp"].about.seed, found["vpt"].about.seed) == seeds
         assert [e.what for e in missing] == ["vpt_appearance", "vpt_dino"]
         assert "has no weights in this version" in missing[0].reason
@@ -197,12 +197,14 @@ def test_weights_that_are_not_meant_are_refused(tmp_path: Path, nothing_shipped:
     with pytest.raises(WeightsError, match="it has no learned policy"):
         policies.find_checkpoints(("max",), given=[folder])
     shutil.copy(folder / "vpt.safetensors", folder / "vpt_old.safetensors")
-    with pytest.raises(WeightsError, match=r"vpt\.safetensors and vpt_old\.safetensors are both of the policy vpt"):
+    with pytest.raises(
+        WeightsError, match=r"vpt_old\.safetensors: is of the policy vpt, as \S+vpt\.safetensors is; expected one"
+    ):
         policies.find_checkpoints(("vpt",), given=[folder])
     with pytest.raises(WeightsError, match="no such file"):
         policies.find_checkpoints(("vpt",), given=[tmp_path / "none"])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(WeightsError, match="has weights of no policy"):
+    with pytest.raises(WeightsError, match=r"empty: holds no \*\.safetensors; expected checkpoints"):
         policies.find_checkpoints(("vpt",), given=[tmp_path / "empty"])
     write_checkpoint(nothing_shipped / "mlp.safetensors", seeded("vpt"))
     with pytest.raises(WeightsError, match=r"mlp\.safetensors: is of the policy vpt; expected mlp"):

@@ -319,7 +319,7 @@ def test_data_that_cannot_be_trained_on_is_named_in_one_line(own: Path, tmp_path
     shard_path(own, "b", read_scene(own, "b").waypoints[2]).unlink()
     with pytest.raises(DatasetError, match=r"set: 1 of 6 waypoints of 'b' are missing, w2 first; .*finish the dataset"):
         train([own], out, rules=QUICK, validate="c")
-    with pytest.raises(TrainingError, match=r"1 scene to train and validate on \(e\); expected at least two"):
+    with pytest.raises(TrainingError, match=r"one: 1 scene to train and validate on; expected at least two"):
         train([write_views(tmp_path / "one", ("e",))], out, rules=QUICK)
     assert not out.exists()
     assert not state_path(out).exists()
@@ -390,7 +390,11 @@ def test_the_command_trains_and_says_what_the_validation_scene_says(
     assert [v["occlusion"] for v in said["verdicts"]] == [True, False]
     for again, code, line in [
         (words, 1, "x.safetensors: exists"),
-        ([*words, "--force", "--validate", "z"], 1, "no scene 'z' to validate on; known: a, b, c"),
+        (
+            [*words, "--force", "--validate", "z"],
+            1,
+            "no scene 'z' to validate on; expected one of its scenes; known: a, b, c",
+        ),
         ([*words, "--force", "--validate", "a"], 0, "validation: a"),
     ]:
         with pytest.raises(SystemExit) as done:

@@ -224,7 +224,7 @@ def split_scenes(scenes: Sequence[SceneFolder], *, validate: str | None = None, 
         )
     if validate is not None and validate not in names:
         raise TrainingError(
-            f"{where}: no scene {validate!r} to validate on; expected one of {', '.join(names)}",
+            f"{where}: no scene {validate!r} to validate on; expected one of its scenes",
             hint=suggestion(validate, names),
         )
     for number, scene in enumerate(scenes):
