@@ -125,6 +125,18 @@ def test_without_patience_the_validation_scene_chooses_no_epoch(nothing_to_learn
     assert float(rows[-1][3]) > min(float(row[3]) for row in rows)
 
 
+def test_two_trainings_do_not_make_one_checkpoint(own: Path, tmp_path: Path) -> None:
+    def start_another(what: str, done: int, total: int) -> None:
+        if what.startswith("train "):
+            with pytest.raises(TrainingError, match=r"x\.safetensors: another training is making it"):
+                train([own], tmp_path / "x.safetensors", rules=dataclasses.replace(QUICK, seed=1))
+
+    train([own], tmp_path / "x.safetensors", rules=dataclasses.replace(QUICK, epochs=1), progress=start_another)
+    assert read_checkpoint(tmp_path / "x.safetensors").about.seed == 0
+    assert {p.name for p in tmp_path.iterdir()} >= {"x.safetensors", "x.md"}
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
 def test_without_a_name_the_scene_of_median_difficulty_validates(own: Path) -> None:
     relabel(own, "a", label=True)
     relabel(own, "b", label=False)

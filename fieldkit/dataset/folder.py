@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
-import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping
@@ -27,7 +25,7 @@ from fieldkit.store.datasets import (
     scene_path,
     write_dataset,
 )
-from fieldkit.store.files import plain, saving
+from fieldkit.store.files import locked, plain, saving
 
 LOCK_FILE, WORK_FOLDER = ".lock", ".work"
 # What a kill leaves of a file that was being written: a dot, the file's name, and eight letters of tempfile's.
@@ -54,20 +52,11 @@ def own(out: Path) -> Iterator[None]:
 
 def _locked(out: Path) -> TextIO:
     """Return the lock file, locked; raises DatasetError when another run holds it."""
-    while True:
-        with saving(out):
-            out.mkdir(parents=True, exist_ok=True)
-            stream = (out / LOCK_FILE).open("w")
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.path.samestat(os.fstat(stream.fileno()), os.stat(out / LOCK_FILE)):
-                    return stream
-            except FileNotFoundError:
-                pass
-            except BlockingIOError as error:
-                stream.close()
-                raise DatasetError(f"{out}: another run is making it", hint="wait for it, or end it") from error
-            stream.close()
+    with saving(out):
+        stream = locked(out / LOCK_FILE)
+    if stream is None:
+        raise DatasetError(f"{out}: another run is making it", hint="wait for it, or end it")
+    return stream
 
 
 def _holds_only_maps(out: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import json
 import math
@@ -15,7 +16,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TextIO, TypeVar
 
 import msgspec
 import numpy as np
@@ -44,6 +45,24 @@ def saving(path: Path) -> Iterator[None]:
             f"{path}: cannot be written: {error.strerror or error}{place}; expected a place that can be written to",
             hint="choose another --out",
         ) from error
+
+
+def locked(path: Path) -> TextIO | None:
+    """Return the file ``path``, made if need be and locked until it is closed; None while another process holds it."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream = path.open("w")
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Its last holder may have removed it meanwhile
+            if os.path.samestat(os.fstat(stream.fileno()), os.stat(path)):
+                return stream
+        except FileNotFoundError:
+            pass
+        except BlockingIOError:
+            stream.close()
+            return None
+        stream.close()
 
 
 def atomic_write(path: Path, data: bytes | str) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.errors import StoreError, TrainingError
-from fieldkit.store.files import atomic_write, convert, plain, saving
+from fieldkit.store.files import atomic_write, convert, locked, plain, saving
 
 Tensors = Mapping[str, NDArray[Any]]
 _KEY = "fieldkit-training"
@@ -53,6 +54,21 @@ class State:
 def state_path(out: Path) -> Path:
     """Return where the state of an unfinished training of a checkpoint lies."""
     return out.with_name(f".{out.name}.training")
+
+
+@contextlib.contextmanager
+def alone(out: Path) -> Iterator[None]:
+    """Hold a checkpoint that is being made: two trainings at once would write one's card beside the other's weights."""
+    path = out.with_name(f".{out.name}.lock")
+    with saving(out):
+        stream = locked(path)
+    if stream is None:
+        raise TrainingError(f"{out}: another training is making it", hint="wait for it, or give another --out")
+    with stream:
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def write_state(out: Path, state: State, *, key: str) -> None:

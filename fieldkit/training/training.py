@@ -23,7 +23,7 @@ from fieldkit.training.examples import Examples, Progress, SceneFolder, Split, f
 from fieldkit.training.fitting import Fitted, Material, fit, machine
 from fieldkit.training.inputs import HistogramInputs, Inputs, TokenInputs
 from fieldkit.training.reducing import fit_reduction
-from fieldkit.training.resuming import forget_state, state_path
+from fieldkit.training.resuming import alone, forget_state, state_path
 from fieldkit.training.rules import APPEARANCE_OF, TrainingRules
 from fieldkit.views import TOKEN_WIDTH
 
@@ -64,12 +64,20 @@ def train(
     One scene is kept to validate on, ``validate`` or the one of median difficulty; ``tests`` are datasets whose scenes
     must not be among them. The same data, rules, machine and number of torch's threads give the same bytes, and a
     killed training goes on where it was when it is called again. Raises DatasetError, StoreError or MapError for data
-    that cannot be used, TrainingError for scenes, labels or an unfinished training that do not fit, and StoreError when
-    ``out`` is in the way.
+    that cannot be used, TrainingError for scenes, labels or an unfinished training that do not fit, or while another
+    training makes the same checkpoint, and StoreError when ``out`` is in the way.
     """
     rules, out = (rules or TrainingRules()).settled(), Path(out)
     _refuse_out(out, force=force)
     split = split_scenes(find_scenes(datasets), validate=validate, tests=tests)
+    with alone(out):
+        # Another training may have ended in between
+        _refuse_out(out, force=force)
+        return _train(split, rules, out, force=force, progress=progress)
+
+
+def _train(split: Split, rules: TrainingRules, out: Path, *, force: bool, progress: Progress | None) -> TrainingReport:
+    """Do what `train` says, once it is known what is trained on and that nobody else does it."""
     _refuse_without_appearance(split, rules)
     scenes = [read_examples(s, progress=progress) for s in (*split.training, split.validation)]
     _refuse_one_class(split, scenes)
