@@ -93,7 +93,7 @@ def _add_appearance(
             maps.add_appearance(out, source, network=network, weights=weights, progress=progress)
     except BaseException:
         _log.warning(
-            "%s: the map is done, without its appearance; add it: %s", out, _adding(out, source, network, weights)
+            "%s: the map is done, without its appearance; add it with %s", out, _adding(out, source, network, weights)
         )
         raise
 
