@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from pathlib import Path
 from typing import Literal
 
@@ -71,14 +72,38 @@ def map_build(
     try:
         with ProgressBars() as progress:
             built = maps.build_map(source, out, feature=feature, force=force, options=options, progress=progress)
-            if appearance != "none":
-                maps.add_appearance(out, source, network=appearance, weights=weights, progress=progress)
     except KeyboardInterrupt:
         _log.warning("%s: interrupted; the same command goes on where it stopped", out)
         raise
     for warning in built.warnings:
         _log.warning("%s: %s", source, warning)
+    if appearance != "none":
+        _add_appearance(out, source, network=appearance, weights=weights)
     print_mapping(maps.map_info(out), title=f"{out}: {built.n_registered} of {built.n_images} images registered")
+
+
+def _add_appearance(
+    out: Path, source: Path, *, network: Literal["efficientnet", "dinov2"], weights: Path | None
+) -> None:
+    """Add its appearance to a map that was just built; where that stops, the same command would refuse the map."""
+    from fieldkit import maps
+
+    try:
+        with ProgressBars() as progress:
+            maps.add_appearance(out, source, network=network, weights=weights, progress=progress)
+    except BaseException:
+        _log.warning(
+            "%s: the map is done, without its appearance; add it with %s", out, _adding(out, source, network, weights)
+        )
+        raise
+
+
+def _adding(out: Path, source: Path, network: str, weights: Path | None) -> str:
+    """Return the command that adds a network's view to a map."""
+    options = ["--source", str(source)]
+    options += [] if network == "efficientnet" else ["--network", network]
+    options += [] if weights is None else ["--weights", str(weights)]
+    return f"`{shlex.join(['fieldkit', 'map', 'appearance', str(out), *options])}`"
 
 
 def map_import(
@@ -205,6 +230,7 @@ def map_appearance(
     source: Path,
     network: Literal["efficientnet", "dinov2"] = "efficientnet",
     weights: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Add to a map what a network of appearance sees at its landmarks, as the policies with appearance need it.
 
@@ -213,9 +239,10 @@ def map_appearance(
         source: folder with the mapping images from which the map was built
         network: network of appearance
         weights: folder where the weights of networks are looked for first
+        force: replace what the map has of this network
     """
     from fieldkit import maps
 
     with ProgressBars() as progress:
-        maps.add_appearance(path, source, network=network, weights=weights, progress=progress)
+        maps.add_appearance(path, source, network=network, weights=weights, force=force, progress=progress)
     print_mapping(maps.map_info(path), title=str(path))

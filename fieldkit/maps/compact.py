@@ -36,6 +36,7 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
     if scene_map.descriptors.dtype != np.uint8:
         raise MapError(f"{path}: {scene_map.feature} descriptors are not 8-bit", hint="compact a map of feature sift")
     surface = None if scene_map.surface is None else coarsen(scene_map.surface, voxel_m=voxel_m)
+    appearance = dict(scene_map.appearance)
     with atomic_folder(Path(out), force=force, marker="map.toml") as folder:
         _write_model(folder, scene_map)
         if scene_map.retrieval is not None and scene_map.image_vectors is not None:
@@ -46,7 +47,7 @@ def compact_map(path: Path, out: Path, *, voxel_m: float = 0.1, force: bool = Fa
             write_ply(folder / "surface.ply", surface)
             surface_entry = msgspec.structs.replace(surface_entry, voxel_m=surface.voxel_m, file="surface.ply")
         digest = content_digest(folder)
-        for network, seen in scene_map.appearance.items():
+        for network, seen in appearance.items():
             write_appearance(folder, network, seen, digest=digest)
         write_map_file(folder, msgspec.structs.replace(entry, version=1, digest=digest, surface=surface_entry))
 

@@ -15,7 +15,7 @@ import numpy as np
 from fieldkit.errors import MapError, suggestion
 from fieldkit.features import FEATURES, Features
 from fieldkit.maps import whole
-from fieldkit.maps.appearance import known_appearances, read_appearances
+from fieldkit.maps.appearance import Appearances, known_appearances
 from fieldkit.maps.colmap import read_model
 from fieldkit.maps.descriptors import MAX_BYTES, read_landmark_descriptors
 from fieldkit.maps.landmarks import landmark_covariance
@@ -174,7 +174,7 @@ def load_map(path: Path) -> SceneMap:
         surface=_read_surface(path, entry.surface),
         retrieval=retrieval,
         image_vectors=vectors,
-        appearance=read_appearances(path, digest=entry.digest, count=len(model.xyz)),
+        appearance=Appearances(path, digest=entry.digest, count=len(model.xyz)),
     )
 
 

@@ -115,7 +115,8 @@ def without_appearance(scene_map: SceneMap, checkpoint: Checkpoint) -> Excluded 
         return None
     return Excluded(
         checkpoint.about.kind,
-        f"{scene_map.path} lacks the appearance {network} of its landmarks; add it with `fieldkit map appearance`",
+        f"{scene_map.path} lacks the appearance {network} of its landmarks; add it: "
+        f"`fieldkit map appearance {scene_map.path} --source IMAGES --network {network}`",
     )
 
 

@@ -15,7 +15,7 @@ COLOURS: dict[str, str] = {
     "mlp": "#c05fa8",
     "vpt": "#159aa8",
     "vpt_dino": "#1f4e79",
-    "vpt_appearance": "#6aa6a0",
+    "vpt_appearance": "#85144b",
     "best_possible": "#14181c",
 }
 # SVG dash lengths, which matplotlib takes in line widths and the page's legend in pixels.

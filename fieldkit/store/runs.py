@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, cast
 from urllib.parse import quote, unquote
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from fieldkit import protocol as protocols
 from fieldkit.cameras import Camera
 from fieldkit.errors import FieldkitError, StoreError
 from fieldkit.frames import Pose, pose
+from fieldkit.store.arrays import RunArrays, read_arrays, refuse_unfitting, write_arrays
 from fieldkit.store.files import atomic_folder, atomic_write, digest, plain_json, read_json, saving
 from fieldkit.store.inputs import write_tum
 from fieldkit.store.tables import (
@@ -37,13 +36,10 @@ from fieldkit.store.tags import read_tags, write_tags
 from fieldkit.types import (
     VIEW_KINDS,
     Applied,
-    Array,
     Candidates,
     Estimate,
     Excluded,
-    PlanView,
     Prior,
-    Reason,
     Run,
     Trial,
     Truth,
@@ -52,10 +48,7 @@ from fieldkit.types import (
     VisitPlan,
 )
 
-T = TypeVar("T")
-# What is known of a visit (session and id) per policy and occlusion
-ByVisit = dict[tuple[str, str], dict[tuple[str, bool | None], T]]
-TAGS_FILE, REASONS_FILE = "tags.toml", "reasons.npz"
+TAGS_FILE = "tags.toml"
 TRIALS = (
     "session", "visit", "policy", "occlusion", "view", "weight", "utility", "status", "cam_position_m",
     "cam_rotation_deg", "body_position_m", "body_rotation_deg", "truth_sigma_m", "truth_sigma_deg", "prior_error_m",
@@ -106,7 +99,7 @@ def write_run(path: Path, run: Run, *, force: bool = False) -> None:
         write_table(folder / "truth.csv", TRUTHS, (_truth_cells(s, t) for s, t in run.truths))
         write_table(folder / "priors.csv", PRIORS, (_prior_cells(p) for p in run.plans))
         write_table(folder / "candidates.csv", CANDIDATES, (row for p in run.plans for row in _candidate_cells(p)))
-        _write_arrays(folder, run)
+        write_arrays(folder, run.plans, run.plan_view)
         _write_poses(folder, run)
         _write_tags(folder, run)
         for key, jpeg in run.thumbnails.items():
@@ -121,9 +114,10 @@ def read_run(path: Path) -> Run:
         raise StoreError(f"{path}: not a run folder; expected run.json in it", hint="make one with `fieldkit replay`")
     head = read_json(path / "run.json", _RunFile, what="run.json of a run folder")
     protocol = protocols.from_dict(head.protocol, source=f"{path / 'run.json'}: protocol")
-    utilities, reasons, plan_view = _read_arrays(path)
+    arrays = read_arrays(path)
     trials = tuple(read_table(path / "trials.csv", TRIALS, _trial))
-    plans = _read_plans(path, utilities, reasons)
+    plans = _read_plans(path, arrays)
+    refuse_unfitting(path, arrays, plans, protocol)
     _check_complete(path, trials, plans, protocol, excluded={e.what for e in head.excluded})
     return Run(
         protocol=protocol,
@@ -137,7 +131,7 @@ def read_run(path: Path) -> Run:
         results=tuple(read_table(path / "estimates.csv", ESTIMATES, _result)),
         truths=tuple(read_table(path / "truth.csv", TRUTHS, _truth)),
         plans=plans,
-        plan_view=plan_view,
+        plan_view=arrays.plan_view,
         thumbnails={unquote(p.stem): p.read_bytes() for p in sorted((path / "thumbs").glob("*.jpg"))},
         excluded=tuple(head.excluded),
         path=str(path),
@@ -292,7 +286,7 @@ def _candidate_cells(p: VisitPlan) -> list[dict[str, object]]:
     ]
 
 
-def _read_plans(path: Path, utilities: ByVisit[Array], reasons: ByVisit[Reason]) -> tuple[VisitPlan, ...]:
+def _read_plans(path: Path, arrays: RunArrays) -> tuple[VisitPlan, ...]:
     rows = read_table(path / "candidates.csv", CANDIDATES, dict)
     plans = []
     for session, prior, error in read_table(path / "priors.csv", PRIORS, _prior):
@@ -304,7 +298,8 @@ def _read_plans(path: Path, utilities: ByVisit[Array], reasons: ByVisit[Reason])
                 f"{path / 'candidates.csv'}: visit {prior.visit}: {error_}", hint="replay the recording again"
             ) from error_
         key = session, prior.visit
-        plans.append(VisitPlan(session, prior, error, candidates, utilities.get(key, {}), reasons.get(key, {})))
+        utilities, reasons = arrays.utilities.get(key, {}), arrays.reasons.get(key, {})
+        plans.append(VisitPlan(session, prior, error, candidates, utilities, reasons))
     return tuple(plans)
 
 
@@ -317,52 +312,6 @@ def _candidates(visit: str, rows: list[dict[str, str]]) -> Candidates:
         visit, tuple(r["view"] for r in rows), tuple(_kind(r["kind"]) for r in rows),
         tuple(needed_pose(r) for r in rows), camera, np.array([r["allowed"] == "true" for r in rows]), forward,
     )  # fmt: skip
-
-
-def _write_arrays(folder: Path, run: Run) -> None:
-    utilities: dict[str, NDArray[Any]] = {}
-    reasons: dict[str, NDArray[Any]] = {}
-    for plan in run.plans:
-        place = [plan.session, plan.prior.visit]
-        for variant, values in plan.utilities.items():
-            utilities[json.dumps([*place, *variant])] = values
-        for variant, reason in plan.reasons.items():
-            rows = np.column_stack([reason.landmarks, reason.raised]).astype(np.float32)
-            reasons[json.dumps([*place, *variant, reason.view])] = rows
-    contents: dict[str, dict[str, NDArray[Any]]] = {
-        "utilities.npz": utilities,
-        "plan.npz": {"landmarks": run.plan_view.landmarks, "cameras": run.plan_view.cameras},
-        **({REASONS_FILE: reasons} if reasons else {}),
-    }
-    for name, content in contents.items():
-        # Keys go into the archive as member names: quoted, so that a session's name cannot act as a path.
-        stream = io.BytesIO()
-        np.savez_compressed(stream, allow_pickle=False, **{quote(k, safe=""): v for k, v in content.items()})
-        atomic_write(folder / name, stream.getvalue())
-
-
-def _read_arrays(path: Path) -> tuple[ByVisit[Array], ByVisit[Reason], PlanView]:
-    utilities: ByVisit[Array] = {}
-    reasons: ByVisit[Reason] = {}
-    try:
-        with np.load(path / "utilities.npz", allow_pickle=False) as archive:
-            for key in archive.files:
-                session, visit, policy, occlusion = json.loads(unquote(key))
-                utilities.setdefault((session, visit), {})[(policy, occlusion)] = archive[key]
-        if (path / REASONS_FILE).is_file():
-            with np.load(path / REASONS_FILE, allow_pickle=False) as archive:
-                for key in archive.files:
-                    session, visit, policy, occlusion, view = json.loads(unquote(key))
-                    rows = archive[key].reshape(-1, 4)
-                    reasons.setdefault((session, visit), {})[(policy, occlusion)] = Reason(
-                        view, rows[:, :3], rows[:, 3]
-                    )
-        with np.load(path / "plan.npz", allow_pickle=False) as archive:
-            return utilities, reasons, PlanView(archive["landmarks"], archive["cameras"])
-    except Exception as error:  # numpy, zip and zlib raise many types for damaged files
-        raise StoreError(
-            f"{path}: utilities.npz, {REASONS_FILE} or plan.npz: {error}", hint="replay the recording again"
-        ) from error
 
 
 def _write_poses(folder: Path, run: Run) -> None:
