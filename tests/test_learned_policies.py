@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import logging
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -272,6 +274,31 @@ def test_a_dataset_is_replayed_with_learned_rows_and_names_those_it_cannot_have(
     for plan in run.plans:
         values = plan.utilities["vpt", True]
         assert (np.isfinite(values) == plan.candidates.allowed).all()
+
+
+def test_the_table_of_a_run_compares_the_declared_policies(whole: Path, tmp_path: Path) -> None:
+    weights = write_seeded(tmp_path / "w", "mlp", training_scenes=("tiny",))
+    rules = msgspec.structs.replace(PAPER, policies=("random", "max", "angle", "mlp", "best_possible"))
+    run = replay_datasets([whole], protocol=rules, out=tmp_path / "run", policy_weights=[weights])
+    named = [("mlp", True), ("max", True)]
+    script = Path(__file__).parents[1] / "docs" / "examples" / "sim_table.py"
+    command = [sys.executable, str(script), str(whole), str(tmp_path / "run")]
+    pictures = [tmp_path / "curves.png", tmp_path / "said.png"]
+    wanted = ["--learned", "mlp", "--curves", str(pictures[0]), "--reliability", str(pictures[1])]
+    done = subprocess.run([*command, *wanted], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    declared, _, others = done.stdout.partition("Declared before the run:")[2].partition("At the other thresholds:")
+    assert declared.count("| mlp - max | yes | 0.1 m / 1 deg |") == declared.count("| mlp - angle | no |") == 1
+    assert others.count("| mlp - max | yes |") == 5
+    assert others.count("| mlp - max | no | 0.1 m / 1 deg |") == 1
+    shares = {n: 100 * scores.recall(scores.group(run.trials)[n], Threshold(0.1, 1.0), pose="cam") for n in named}
+    assert f"| yes | mlp {shares['mlp', True]:.1f} | max {shares['max', True]:.1f} |" in done.stdout
+    assert "No test: mlp was trained or validated on tiny." in done.stdout
+    assert "Not run: superpoint" in done.stdout
+    assert all(p.stat().st_size > 1000 for p in pictures)
+    refused = subprocess.run([*command, "--learned", "vpt"], capture_output=True, text=True, check=False)
+    assert refused.returncode == 1
+    assert "has no rows to compare vpt with max; expected both, each way" in refused.stderr
 
 
 def test_a_run_that_lost_rows_is_still_told_from_one_without_weights(whole: Path, tmp_path: Path) -> None:
