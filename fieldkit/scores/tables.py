@@ -47,9 +47,9 @@ def score_dict(run: Run, *, thresholds: Sequence[Threshold] | None = None) -> di
             }
             for s in summarize_run(run, thresholds=chosen)
         ],
-        "in_sample": {name: list(scenes) for name, scenes in in_sample(run).items()},
         "comparisons": [_comparison_dict(c) for c in _comparisons(run, chosen)],
         "truth": trust_dict(trust(run, thresholds=chosen)),
+        "in_sample": {name: list(scenes) for name, scenes in in_sample(run).items()},
     }
 
 
