@@ -275,7 +275,16 @@ def test_score_dict_has_the_schema_and_no_infinity() -> None:
     failed = tuple(dataclasses.replace(t, cam_error=(math.inf,) * 2, body_error=(math.inf,) * 2) for t in run.trials)
     for values in (score_dict(run), score_dict(dataclasses.replace(run, trials=failed))):
         json.dumps(values, allow_nan=False)
-        assert list(values) == ["version", "protocol", "pose", "thresholds", "policies", "comparisons", "truth", "in_sample"]
+        assert list(values) == [
+            "version",
+            "protocol",
+            "pose",
+            "thresholds",
+            "policies",
+            "comparisons",
+            "truth",
+            "in_sample",
+        ]
         for policy in values["policies"]:
             assert list(policy) == [
                 "name", "occlusion", "n", "recall", "interval", "median_position_m", "median_rotation_deg", "open",
